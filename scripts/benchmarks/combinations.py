@@ -18,6 +18,9 @@ position is uncertain. The MSE ratio is the squared error relative to the trace 
 least one surface has in sight; the share of wrong fixes is that of positions of other users. The
 intervals are from resampling the users.
 
+With `--walking`, each ingredient meets the users of config/lab_walk.yaml instead, who walk at
+1 m/s while the surface steps its patterns. Cycles of a track are then 0.6 s apart, carriers are
+off by 1 Hz, and the region is that of the lab.
 """
 
 import argparse
@@ -46,11 +49,10 @@ from rhs_isac_ros.support.arguments import output_file
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.system import System
 
-N_CYCLES, PERIOD_S, SPEED_MPS = 20, 0.1, 1.0
+N_CYCLES, SPEED_MPS = 20, 1.0
 SHELL_M = (0.5, 5.0)
 # A variance above this counts as a dimension [m^2].
 LEAST_M2 = 1e-8
-POSES = {'front': Pose(), 'side': Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.0, 1.0))}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,11 +68,38 @@ class Setting:
     prior_std_m: float = 0.0  # of a mixture around the user; 0 without one
     library: Callable[[], Library] = lambda: EMPTY
     radio: Callable[[Scenario, Air], Radio] = EmulatedRadio
+    plan: str = 'bandplan'  # of `frame.SYSTEMS`
+    distance_m: float = 10.0  # of the centre of the region from each surface
+    period_s: float = 0.1  # of the cycles of a track
 
     @property
     def bounds_m(self) -> np.ndarray:
         """Bounds of the region in the frame of the site, float64 [2, 3] [m]."""
-        return np.array([10.0, 0.0, 0.0]) + np.outer([-0.5, 0.5], self.size_m)
+        return np.array([self.distance_m, 0.0, 0.0]) + np.outer([-0.5, 0.5], self.size_m)
+
+    @property
+    def poses(self) -> dict[str, Pose]:
+        """Poses of the surfaces, which face the centre of the region."""
+        return {'front': Pose(), 'side': Pose(
+            (self.distance_m, -self.distance_m, 0.0), (0.0, 0.0, 1.0, 1.0))}
+
+    @property
+    def walks(self) -> bool:
+        """Whether users walk while the surface steps its patterns."""
+        return self.plan == 'lab_walk'
+
+    def walking(self) -> 'Setting':
+        """Return the same setting for the walking users of the lab; raise Refused without one."""
+        if self.radio is not EmulatedRadio or self.library is not Setting.library:
+            raise Refused('config/lab_walk.yaml: expected neither samples nor a library')
+        if 'element_error_rms' in self.declared or 'failed_element_share' in self.declared:
+            raise Refused('config/lab_walk.yaml: expected known elements')
+        # An offset turns the phase by less than half a turn between two frames.
+        declared = {name: min(value, 1.0) if name == 'carrier_offset_std_hz' else value
+                    for name, value in self.declared.items()}
+        return dataclasses.replace(
+            self, declared=declared, plan='lab_walk', distance_m=4.0, period_s=0.6,
+            size_m=tuple(np.multiply(self.size_m, (0.4, 0.4, 0.5))))
 
 
 Ingredient = Callable[[Setting], Setting]
@@ -121,8 +150,8 @@ class Surface:
     """What is known about one surface in a cell."""
 
     def __init__(self, setting: Setting, name: str) -> None:
-        base, self.codebook = frame.system('bandplan')
-        pose = dataclasses.replace(POSES[name], uncertainty=setting.pose_error)
+        base, self.codebook = frame.system(setting.plan)
+        pose = dataclasses.replace(setting.poses[name], uncertainty=setting.pose_error)
         corners = np.stack(np.meshgrid(*setting.bounds_m.T), axis=-1).reshape(-1, 3)
         # Rounded, because a region without extent along an axis has none in any frame.
         places = np.round(pose.to_surface(corners), 6)
@@ -131,6 +160,8 @@ class Surface:
             base, pose=pose, roi_center_m=tuple((low + high) / 2), roi_size_m=tuple(high - low),
             **setting.declared)
         self._library = adapted(setting.library(), self.scenario)
+        self._states = System.from_yaml(
+            frame.CONFIG / 'lab_walk_system.yaml').surface if setting.walks else None
         self._make_radio = setting.radio
         self.estimator = functools.cache(self._estimator)
 
@@ -148,12 +179,13 @@ class Surface:
         pose = self.scenario.pose
         std = np.sqrt(np.diag(pose.covariance))
         return EmulatedLink(dataclasses.replace(
-            self.scenario, pose=pose.displaced(std * error)), seed, self._make_radio)
+            self.scenario, pose=pose.displaced(std * error)), seed, self._make_radio,
+            self._states)
 
     def _estimator(self, codebook: Codebook) -> BayesEstimator:
         # The positioner creates the estimators of a library like this, too.
-        return BayesEstimator(System(self.scenario, codebook), reject_outside=True,
-                              lazy=codebook is not self.codebook)
+        return BayesEstimator(System(self.scenario, codebook, self._states),
+                              reject_outside=True, lazy=codebook is not self.codebook)
 
 
 def adapted(library: Library, scenario: Scenario) -> Library:
@@ -243,7 +275,7 @@ class Results(NamedTuple):
     """The positions of a cell, one row for each cycle of each user."""
 
     estimate: Estimate
-    positions: np.ndarray  # Float64 [N, 3] [m].
+    states: np.ndarray  # Positions, and velocities if users walk, float64 [N, 3 or 6].
     expected: np.ndarray  # Whether the user should have a position, bool [N].
     users: np.ndarray  # Number of the user, int [N].
 
@@ -251,7 +283,7 @@ class Results(NamedTuple):
         """Return the figures of the cell; None where there is nothing to average."""
         fix = np.asarray(self.estimate.fix)
         counted = fix & self.expected
-        errors = (self.estimate.mean - self.positions)[counted]
+        errors = (self.estimate.mean - self.states[:, :3])[counted]
         covariances, users = self.estimate.covariance[counted], self.users[counted]
         squares = np.sum(errors * np.linalg.solve(covariances, errors[..., None])[..., 0], axis=1)
         dimensions = np.sum(np.linalg.eigvalsh(covariances) > LEAST_M2, axis=1)
@@ -270,7 +302,20 @@ class Results(NamedTuple):
             'mse_ratio': ratio, 'fix': share(fix[self.expected], self.users[self.expected]),
             'wrong_fix': share(fix[~self.expected], self.users[~self.expected]),
             'mse_m2': frame.mean_interval(squared, users),
-            'n': len(fix)}
+            **self._velocities(counted, share), 'n': len(fix)}
+
+    def _velocities(self, counted: np.ndarray, share: Callable[..., Any]) -> dict[str, Any]:
+        """Return the figures of velocities, if there are any."""
+        if self.states.shape[1] == 3 or not counted.any():
+            return {}
+        users, joint = self.users[counted], self.estimate.joint_covariance[counted]
+        errors = (np.hstack([self.estimate.mean, self.estimate.velocity]) - self.states)[counted]
+        inverse = np.linalg.pinv(joint, LEAST_M2, hermitian=True)
+        squares = np.einsum('na,nab,nb->n', errors, inverse, errors)
+        dimensions = np.linalg.matrix_rank(joint, LEAST_M2, hermitian=True)
+        squared = frame.mean_interval(np.sum(errors[:, 3:]**2, axis=1), users)
+        return {'velocity_rms_mps': squared and tuple(one**0.5 for one in squared),
+                'both_in_region': share(squares <= chdtri(dimensions, 0.05), users)}
 
 
 def run_cell(setting: Setting, n: int, rng: np.random.Generator) -> Results:
@@ -296,10 +341,10 @@ def run_cell(setting: Setting, n: int, rng: np.random.Generator) -> Results:
 def located(setting: Setting, locator: OneSurface | SeveralSurfaces,
             links: Mapping[Surface, EmulatedLink], user: int, path: np.ndarray,
             rng: np.random.Generator) -> Iterator[Estimate]:
-    """Yield the estimates of one user along a path, float64 [C, 3] [m]."""
+    """Yield the estimates of one user along a path, float64 [C, 3] [m] or [C, 6] [m, m/s]."""
     for cycle_id, place in enumerate(path, 1):
-        time_s, std_m = PERIOD_S * cycle_id, setting.prior_std_m
-        centre = place + std_m * rng.standard_normal(3)
+        time_s, std_m = setting.period_s * cycle_id, setting.prior_std_m
+        centre = place[:3] + std_m * rng.standard_normal(3)
         prior = Mixture(np.zeros(1), centre[None], std_m**2 * np.eye(3)[None]) if std_m else None
         predicted = prior.moments() if prior else locator.predict(time_s)
         looks = []
@@ -311,29 +356,34 @@ def located(setting: Setting, locator: OneSurface | SeveralSurfaces,
 
 
 def inside_path(setting: Setting, rng: np.random.Generator) -> np.ndarray:
-    """Return the positions of a walk in the region, float64 [C, 3] [m]."""
+    """Return a walk in the region, positions [C, 3] [m] or also velocities, [C, 6] [m, m/s]."""
     low, high = setting.bounds_m
     walk = RandomWalk(Scenario(roi_center_m=(low + high) / 2, roi_size_m=setting.size_m),
                       SPEED_MPS, rng)
-    return np.array([walk.state(PERIOD_S * cycle)[0] for cycle in range(setting.n_cycles)])
+    states = np.array([np.hstack(walk.state(setting.period_s * cycle))
+                       for cycle in range(setting.n_cycles)])
+    return states if setting.walks else states[:, :3]
 
 
 def outside_path(setting: Setting, surfaces: Sequence[Surface], rng: np.random.Generator
                  ) -> np.ndarray:
-    """Return a place outside of the region, in front of all surfaces, float64 [C, 3] [m]."""
+    """Return a place outside of the region, in front of all surfaces, as `inside_path`."""
     low, high = setting.bounds_m
     while True:
         place = rng.uniform(low - SHELL_M[1], high + SHELL_M[1])
         distance_m = np.linalg.norm(place - np.clip(place, low, high))
         if SHELL_M[0] < distance_m < SHELL_M[1] and all(
                 one.scenario.pose.to_surface(place)[0] > 1 for one in surfaces):
-            return np.tile(place, (setting.n_cycles, 1))
+            return np.tile(np.append(place, np.zeros(3 * setting.walks)), (setting.n_cycles, 1))
 
 
-def pairs(names: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Yield each ingredient with itself and with those after it, if one of both is named."""
+def pairs(names: Sequence[str], walking: bool = False) -> Iterator[tuple[str, str]]:
+    """Yield each ingredient with itself and with those after it, if one of both is named.
+
+    With `walking`, yield each only with itself.
+    """
     for one, other in itertools.combinations_with_replacement(INGREDIENTS, 2):
-        if not names or one in names or other in names:
+        if (not names or one in names or other in names) and (one == other or not walking):
             yield one, other
 
 
@@ -344,6 +394,7 @@ def main() -> None:
     add('--only', choices=INGREDIENTS, action='append', default=[],
         help='only cells with this ingredient; may be repeated')
     add('--csv', type=output_file, help='CSV file for the table of the documentation')
+    add('--walking', action='store_true', help='each ingredient with users who walk in the lab')
     options = parser.parse_args()
     print(f'{options.positions} positions, seed {options.seed}\n')
     results = measure(options)
@@ -358,16 +409,19 @@ Cells = dict[str, dict[str, dict[str, Any]]]
 
 def measure(options: argparse.Namespace) -> Cells:
     """Measure the requested cells; each is stored under both orders of its ingredients."""
-    chosen = set(pairs(options.only))
+    chosen = set(pairs(options.only, options.walking))
     cells = {(one, other): ' + '.join(dict.fromkeys((one, other)))
              for one, other in pairs(()) if (one, other) in chosen}
     found = frame.measured(options, 'combinations', measured_cell, {
-        name: {'one': one, 'other': other, 'n': options.positions, 'seed': options.seed}
+        name: {'one': one, 'other': other, 'n': options.positions, 'seed': options.seed,
+               'walking': options.walking}
         for (one, other), name in cells.items()})
     table = frame.Table(['ingredients'], {
         'fix [%]': ('fix', 1), 'wrong fix [%]': ('wrong_fix', 1),
         'in the 95 % region [%]': ('in_region', 1), 'NEES': ('nees', 2),
-        'dimensions': ('dimensions', 1), 'MSE ratio': ('mse_ratio', 2)})
+        'dimensions': ('dimensions', 1), 'MSE ratio': ('mse_ratio', 2),
+        **({'velocity, rms [m/s]': ('velocity_rms_mps', 2),
+            'both in their region [%]': ('both_in_region', 1)} if options.walking else {})})
     results: Cells = {}
     for (one, other), name in cells.items():
         row = found[name]
@@ -377,21 +431,22 @@ def measure(options: argparse.Namespace) -> Cells:
     return results
 
 
-def measured_cell(one: str, other: str, n: int, seed: int) -> dict[str, Any]:
+def measured_cell(one: str, other: str, n: int, seed: int, walking: bool) -> dict[str, Any]:
     """Run a job: return the figures of a cell."""
     # The random numbers of a cell do not depend on the other cells.
     number = [*pairs(())].index((one, other))
-    return cell(one, other, n, streams.generator(seed, streams.HELD_OUT, number)) | {
+    return cell(one, other, n, streams.generator(seed, streams.HELD_OUT, number), walking) | {
         'positions': n, 'seed': seed}
 
 
-def cell(one: str, other: str, n: int, rng: np.random.Generator) -> dict[str, Any]:
+def cell(one: str, other: str, n: int, rng: np.random.Generator, walking: bool = False
+         ) -> dict[str, Any]:
     """Return the figures of a cell, or why the software refuses it."""
     setting = Setting()
     for name in dict.fromkeys((one, other)):
         setting = INGREDIENTS[name](setting)
     try:
-        return run_cell(setting, n, rng).figures()
+        return run_cell(setting.walking() if walking else setting, n, rng).figures()
     except REFUSALS as error:
         return {'refused': str(error)}
 

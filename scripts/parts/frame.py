@@ -37,7 +37,8 @@ from rhs_isac_ros.support.pictures import PICTURE_FORMATS, write_picture
 CONFIG = Path(__file__).parents[2] / 'config'
 # Scenario and codebook of the two systems that most benchmarks compare.
 SYSTEMS = {'table1': ('table1.yaml', 'codebook_ambiguity.yaml'),
-           'bandplan': ('bandplan.yaml', 'codebook_bandplan.yaml')}
+           'bandplan': ('bandplan.yaml', 'codebook_bandplan.yaml'),
+           'lab_walk': ('lab_walk.yaml', 'codebook_lab.yaml')}
 # A value and the ends of its 95 % interval.
 Interval = tuple[float, float, float]
 # Squared Mahalanobis radius of the 95 % region of an estimate.

@@ -43,6 +43,18 @@ def test_a_site_has_positions_with_a_track_or_a_prior(other, n, rng, monkeypatch
     assert found['mse_m2'][0] < 1
 
 
+def test_walking_users_meet_each_ingredient_alone(rng, monkeypatch):
+    chosen = list(pairs([], walking=True))
+    assert chosen == [(name, name) for name in INGREDIENTS]
+    assert cell('library', 'library', 1, rng, True)['refused'].startswith('config/lab_walk.yaml')
+    setting = INGREDIENTS['carrier'](INGREDIENTS['thin'](Setting())).walking()
+    assert setting.declared['carrier_offset_std_hz'] == 1
+    (path,) = combinations.inside_path(setting, rng)
+    assert path.shape == (6,)
+    assert np.linalg.norm(path[3:]) == pytest.approx(1)
+    np.testing.assert_allclose(setting.bounds_m, [[2, -2, 0], [6, 2, 0]])
+
+
 def test_users_outside_count_only_for_wrong_fixes():
     found = cell('thin', 'outside', 12, np.random.default_rng(3))
     assert found['n'] == 12
@@ -60,10 +72,11 @@ def test_a_site_has_no_positions_of_users_outside():
 def test_finished_cells_are_kept_until_all_are_measured(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     options = argparse.Namespace(
-        positions=5, seed=1, only=['site'], json=tmp_path / 'cells.json', jobs=1, dask=None)
+        positions=5, seed=1, only=['site'], json=tmp_path / 'cells.json', jobs=1, dask=None,
+        walking=False)
     measured = []
 
-    def counted(one, other, n, rng):
+    def counted(one, other, n, rng, walking):
         measured.append((one, other))
         if len(measured) == 3:
             raise KeyboardInterrupt
