@@ -1,12 +1,19 @@
 """Positions and velocities of users who move during a cycle."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from walking_users import inside, system_of, users_of
 
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import to_polar, to_positions
 from rhs_isac_ros.positioning import BayesEstimator, MlEstimator
 from rhs_isac_ros.positioning.likelihood import Likelihood
+from rhs_isac_ros.system import System
+
+CONFIG = Path(__file__).parents[2] / 'config'
 
 
 @pytest.fixture(scope='module')
@@ -145,3 +152,18 @@ def test_ml_has_the_most_likely_velocity(walking):
     estimate = MlEstimator(system).estimate(system.sample(states, rng))
     assert np.abs(estimate.velocity - states[:, 3:]).max() < 1
     assert np.linalg.eigvalsh(estimate.joint_covariance).min() > -1e-12
+
+
+@pytest.mark.parametrize(('file', 'codebook'), [
+    ('table1', 'codebook_ambiguity'), ('bandplan', 'codebook_bandplan')])
+def test_users_at_rest_cost_nothing_for_those_who_walk(file, codebook):
+    scenario = Scenario.from_yaml(CONFIG / f'{file}.yaml')
+    system = System(scenario, Codebook.load(CONFIG / f'{codebook}.yaml'))
+    estimator = BayesEstimator(system, lazy=True)
+    assert not estimator._movement
+    assert estimator._likelihood.nuisance.velocity.shape == (3, 0)
+    positions = scenario.sample_positions(5, np.random.default_rng(1))
+    mean, slopes = system.mean_and_jacobian(positions)
+    at_rest, by_state = system.mean_and_jacobian(np.hstack([positions, np.zeros((5, 3))]))
+    np.testing.assert_allclose(at_rest, mean, rtol=1e-9)
+    np.testing.assert_allclose(by_state[:, :3], slopes, rtol=1e-9, atol=1e-12)
