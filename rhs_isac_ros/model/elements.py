@@ -46,8 +46,8 @@ from rhs_isac_ros.support import streams
 # Quadrature nodes along each side of the region of interest. A few suffice, because the carrier
 # cancels in the product of the gain in one sub-band and the conjugate gain in another.
 _ROI_NODES = 8
-# Base-2 logarithm of the number of quasi-random positions over which covariances are averaged.
-_LOG2_NODES = 7
+# Number of quasi-random positions over which covariances are averaged.
+_N_NODES = 128
 # Number of positions evaluated at a time.
 _BLOCK = 32
 
@@ -88,7 +88,7 @@ class SurfaceModel:
         and of the multipath.
         """
         low, high = scenario.roi_bounds_m
-        nodes = low + streams.sobol(3, 0).random(2**_LOG2_NODES) * (high - low)
+        nodes = low + streams.unit_points()[:_N_NODES] * (high - low)
         scattered, direct = self.errors(scenario, beams)
         return np.mean([
             with_direct_errors(scattered, direct, block).mean(axis=0)

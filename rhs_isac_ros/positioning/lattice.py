@@ -22,15 +22,10 @@ from rhs_isac_ros.model.geometry import (
     to_positions,
 )
 from rhs_isac_ros.positioning.segments import Segments
-from rhs_isac_ros.support import streams
 
 # Phase error of a template at the edge of the aperture or of the band [rad] at which the next
 # template or range bin takes over. The slopes of the templates correct the error to first order.
 PHASE_ERROR = 0.2
-
-
-# Number of positions that represent the region.
-_N_POINTS = 1024
 
 
 class _Limits(NamedTuple):
@@ -137,12 +132,6 @@ def carrier_wavenumbers(scenario: Scenario) -> np.ndarray:
 def subband_wavenumbers(scenario: Scenario) -> np.ndarray:
     """Return the wavenumbers k_n of the sub-bands, float64 [N_B, N_SB] [1/m]."""
     return 2 * np.pi * subband_frequencies_hz(scenario) / SPEED_OF_LIGHT_MPS
-
-
-@functools.cache
-def unit_points(size: int = 3) -> np.ndarray:
-    """Return quasi-random points in the unit cube, float64 [1024, size], read-only."""
-    return read_only(streams.sobol(size, 0).random(_N_POINTS))
 
 
 class Shell(NamedTuple):

@@ -26,10 +26,11 @@ from rhs_isac_ros.model.geometry import stands_still, velocity_std_mps
 from rhs_isac_ros.positioning.estimate import Fit
 from rhs_isac_ros.positioning.failures import refinement_of
 from rhs_isac_ros.positioning.grid import Starts
-from rhs_isac_ros.positioning.lattice import Resolution, subband_wavenumbers, unit_points
+from rhs_isac_ros.positioning.lattice import Resolution, subband_wavenumbers
 from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
 from rhs_isac_ros.positioning.search import Modes, ascend, one_step
 from rhs_isac_ros.positioning.segments import select
+from rhs_isac_ros.support import streams
 from rhs_isac_ros.system import System
 
 # Speeds of users whose scenario declares none [m/s]: one at which frames are long, and the
@@ -162,7 +163,7 @@ def _frames(system: System) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     scenario, resolution = system.scenario, Resolution.of(system.scenario)
     low, high = scenario.roi_bounds_m
     whitened, _ = system.mean_and_jacobian(
-        low + (high - low) * unit_points()[:_POSITIONS], np.zeros((_POSITIONS, 3, 0)),
+        low + (high - low) * streams.unit_points()[:_POSITIONS], np.zeros((_POSITIONS, 3, 0)),
         whitened=True)
     energies = np.sum(np.abs(whitened)**2, axis=(1, 2))
     offset_m = _OFFSET * SPEED_OF_LIGHT_MPS * min(

@@ -28,12 +28,13 @@ from rhs_isac_ros.model.geometry import jacobian, region_information, to_polar
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.estimate import regular
-from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Grid, Resolution, unit_points
+from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Grid, Resolution
 from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
 from rhs_isac_ros.positioning.mixture import Mixture, overlap
 from rhs_isac_ros.positioning.search import EXACT_MARGIN, Modes, expanded_at
 from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.positioning.sheets import Sheets, move_inside
+from rhs_isac_ros.support import streams
 
 # Probability that a prior does not hold.
 WRONG = 0.1
@@ -214,7 +215,7 @@ def constant_shares(model: MeasurementModel) -> np.ndarray:
     if model.elements.is_exact:
         return np.zeros(3)
     scenario, (low, high) = model.scenario, model.scenario.roi_bounds_m
-    positions = low + unit_points()[:_LIMITS.nodes] * (high - low)
+    positions = low + streams.unit_points()[:_LIMITS.nodes] * (high - low)
     by_point = jacobian(to_polar(positions))
     mean, slopes = model.mean_and_jacobian(positions, by_point)
     nuisance = nuisance_of(scenario)

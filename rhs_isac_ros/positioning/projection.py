@@ -26,7 +26,7 @@ from rhs_isac_ros.model.geometry import (
     to_positions,
 )
 from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.positioning.lattice import unit_points
+from rhs_isac_ros.support import streams
 
 # Number of measurements of a band up to which the projection costs more than it saves.
 _FEW = 128
@@ -116,7 +116,7 @@ def projected(model: MeasurementModel) -> MeasurementModel:
             or model.scenario.user_speed_std_mps or model.n_whitened <= _FEW * n_bands):
         return model
     low, high = model.scenario.roi_bounds_m
-    means = white_means(model, low + (high - low) * unit_points())
+    means = white_means(model, low + (high - low) * streams.unit_points())
     return ProjectedModel(model, basis_of([means]))
 
 
@@ -129,7 +129,7 @@ def at_ranges(model: MeasurementModel, ranges_m: np.ndarray, points: np.ndarray,
     """
     full, basis = model, np.tile(np.eye(model.combined_root.shape[1]), (model.shape[0], 1, 1))
     if isinstance(model, ProjectedModel):
-        few = points[::-(-len(points) // len(unit_points()))]
+        few = points[::-(-len(points) // len(streams.unit_points()))]
         full = model.full
         basis = basis_of([white_means(full, to_positions(few))])
     return [ProjectedModel(full, basis, np.full(2, range_m), max_error)

@@ -21,11 +21,11 @@ from rhs_isac_ros.positioning.lattice import (
     Grid,
     Resolution,
     lay_grid,
-    unit_points,
     whiten,
 )
 from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.segments import Segments
+from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.threads import map_blocks
 
 # Number of points that represent a standard Gaussian.
@@ -126,10 +126,10 @@ def _positions_in(scenario: Scenario, part: Grid | None) -> np.ndarray:
     """Return evenly spread positions in the region, or in the box of a part of its grid."""
     low, high = scenario.roi_bounds_m
     if part is None:
-        return low + (high - low) * unit_points()
+        return low + (high - low) * streams.unit_points()
     centres = to_positions(part.points)
     low, high = (np.clip(edge, low, high) for edge in (centres.min(axis=0), centres.max(axis=0)))
-    return low + (high - low) * unit_points()[:_LIMITS.part_moments]
+    return low + (high - low) * streams.unit_points()[:_LIMITS.part_moments]
 
 
 def _moments(model: MeasurementModel, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -162,7 +162,7 @@ def standard_normal(n: int, size: int = 3) -> np.ndarray:
     # The points are kept with the table because these imports take longer than loading a table.
     from scipy.special import ndtri
 
-    return read_only(ndtri(np.clip(unit_points(size)[:n], 1e-6, 1 - 1e-6)))
+    return read_only(ndtri(np.clip(streams.unit_points(size)[:n], 1e-6, 1 - 1e-6)))
 
 
 class Filters(NamedTuple):

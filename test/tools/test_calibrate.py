@@ -48,22 +48,31 @@ def watch(make_watch):
 
 
 @pytest.fixture(scope='module')
-def recording(surface, write_recording, tmp_path_factory):
-    """A recording of users at known positions, before any calibration."""
-    rng = np.random.default_rng(0)
-    positions = SCENARIO.sample_positions(N_PILOTS, rng)
-    received = simulate_received(SCENARIO, CODEBOOK, positions, rng, surface)
-    sizes = SCENARIO.n_bands, SCENARIO.n_subbands, SCENARIO.n_frames
-    about = {'scenario_id': SCENARIO.id, 'user': 1}
-    return write_recording(
-        tmp_path_factory.mktemp('recording') / 'run.mcap',
-        [convert.CodebookMessage.of(CODEBOOK, scenario_id=SCENARIO.id), *(
-            message for number, (position, signals) in enumerate(
-                zip(positions, received, strict=True), 1)
-            for message in (
-                m.GroundTruth(cycle_id=number, position=position, velocity=np.zeros(3), **about),
-                m.ReceivedSignals(cycle_id=number, codebook_id=CODEBOOK.id,
-                                  signals=signals.reshape(sizes), **about)))], NAMESPACE)
+def record(write_recording, tmp_path_factory):
+    """Function that records users at known positions, in given namespaces of messages."""
+    def record(n, surface=None, *namespaces, name='run.mcap'):
+        rng = np.random.default_rng(0)
+        positions = SCENARIO.sample_positions(n, rng)
+        received = simulate_received(SCENARIO, CODEBOOK, positions, rng, surface)
+        sizes = SCENARIO.n_bands, SCENARIO.n_subbands, SCENARIO.n_frames
+        about = {'scenario_id': SCENARIO.id, 'user': 1}
+        return write_recording(
+            tmp_path_factory.mktemp('recording') / name,
+            [convert.CodebookMessage.of(CODEBOOK, scenario_id=SCENARIO.id), *(
+                message for number, (position, signals) in enumerate(
+                    zip(positions, received, strict=True), 1)
+                for message in (
+                    m.GroundTruth(
+                        cycle_id=number, position=position, velocity=np.zeros(3), **about),
+                    m.ReceivedSignals(cycle_id=number, codebook_id=CODEBOOK.id,
+                                      signals=signals.reshape(sizes), **about)))], *namespaces)
+    return record
+
+
+@pytest.fixture(scope='module')
+def recording(record, surface):
+    """A recording before any calibration."""
+    return record(N_PILOTS, surface, NAMESPACE)
 
 
 @pytest.fixture
@@ -194,21 +203,9 @@ def test_boards_are_compared_and_the_best_one_is_fitted(tmp_path, capsys):
 
 
 def test_pilots_of_a_site_have_the_true_positions_of_its_leading_surface(
-        write_recording, tmp_path, monkeypatch):
+        record, tmp_path, monkeypatch):
     """The other surfaces record none."""
-    rng = np.random.default_rng(0)
-    positions = SCENARIO.sample_positions(4, rng)
-    sizes, about = (SCENARIO.n_bands, SCENARIO.n_subbands, SCENARIO.n_frames), {
-        'scenario_id': SCENARIO.id, 'user': 1}
-    file = write_recording(tmp_path / 'site.mcap', [
-        convert.CodebookMessage.of(CODEBOOK, scenario_id=SCENARIO.id), *(
-            message for number, (position, signals) in enumerate(zip(
-                positions, simulate_received(SCENARIO, CODEBOOK, positions, rng), strict=True), 1)
-            for message in (
-                m.GroundTruth(cycle_id=number, position=position, velocity=np.zeros(3), **about),
-                m.ReceivedSignals(cycle_id=number, codebook_id=CODEBOOK.id,
-                                  signals=signals.reshape(sizes), **about)))],
-        '/lab/side', {m.GroundTruth: '/lab/front'})
+    file = record(4, None, '/lab/side', {m.GroundTruth: '/lab/front'}, name='site.mcap')
     monkeypatch.setattr(calibrate, 'read_networks', lambda path: Recorded(
         None, dict.fromkeys(('front', 'side'), SCENARIO), SCENARIO.roi_bounds_m))
     done = call(file, '--namespace', '/lab/side', '--board', 'phase', '--output',
