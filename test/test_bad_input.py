@@ -80,6 +80,7 @@ CALLS = [
     ('tools.replay', ['garbage', '--estimator', 'magic'], "estimator: 'magic', expected one of"),
     ('tools.replay', ['garbage', '--config', 'good.yaml', '--site', 'good.yaml'], 'with --site'),
     ('tools.replay', ['garbage', '--publish', '--estimator', 'ml'], 'not allowed with'),
+    ('tools.replay', ['garbage', '--publish', '--library', 'garbage'], 'not allowed with'),
     ('tools.replay', ['garbage', '--estimator', 'neural', '--calibration', 'garbage'],
      'not allowed with --estimator neural'),
     ('tools.replay', ['garbage', '--rate', '2'], 'expected together with --publish'),

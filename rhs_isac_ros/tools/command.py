@@ -119,7 +119,7 @@ def none_within(what: str, timeout_s: float) -> ToolError:
 def missing_codebook(source: object, codebook_id: str) -> RecordingError:
     """Return the error for a codebook that is neither in a source nor an option."""
     return RecordingError(f'{source}: codebook {codebook_id}: not in the recording; give its file '
-                          'with --codebook FILE')
+                          'with --codebook FILE, or with --library FILE of replay')
 
 
 def nothing_recorded(path: Path, what: str, namespace: str) -> RecordingError:

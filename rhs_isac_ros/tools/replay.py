@@ -15,6 +15,7 @@ import numpy as np
 
 from rhs_isac_ros.calibration import load_surface
 from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.codebook.library import Library
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.cycle_log import Key, SignalLog
 from rhs_isac_ros.positioning import (
@@ -164,8 +165,8 @@ class SiteRecording(Recording):
 def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
     """Compare the errors of each surface and of the fusion with the recorded errors."""
     given = [name for name in (
-        'publish', 'system', 'codebook', 'config', 'calibration', 'estimator-options', 'model',
-        'track') if getattr(options, name.replace('-', '_'))]
+        'publish', 'system', 'codebook', 'library', 'config', 'calibration',
+        'estimator-options', 'model', 'track') if getattr(options, name.replace('-', '_'))]
     if any(kind.name != BayesEstimator.name for kind, _ in options.estimator):
         given.append('estimator')
     if given:
@@ -186,9 +187,9 @@ def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
 
 def _conflict(options: argparse.Namespace) -> str:
     if options.publish and (options.estimator or options.estimator_options or options.model
-                            or options.calibration or options.track):
+                            or options.calibration or options.library or options.track):
         return ('argument --publish: not allowed with --estimator, --estimator-options, --model, '
-                '--calibration or --track, because running nodes estimate')
+                '--calibration, --library or --track, because running nodes estimate')
     kinds = options.estimator or [EstimatorKind(BayesEstimator.name)]
     try:
         options.estimator = [(kind, kind.parse(options.estimator_options)) for kind in kinds]
@@ -228,6 +229,10 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
         return republish.republish(options, arguments)
     recording = load(options.file, options.namespace, options.config, options.site)
     (scenario,), (log,) = recording.scenarios.values(), recording.logs.values()
+    if options.library:
+        library = Library.load(options.library)
+        library.check(scenario)
+        log.codebooks.update(library.by_id)
     codebooks = _codebooks(recording, options.codebook)
     names = sorted({estimate.estimator for estimate in log.estimates.values()})
     command.print_now(f'{len(recording.truths)} cycles')
@@ -298,6 +303,8 @@ def _parser() -> argparse.ArgumentParser:
     add('--track-speed', type=positive_float, metavar='MPS',
         help=f'typical speed of the users (default: {Motion.speed_mps:g} m/s)')
     command.add_files(parser, 'codebook', 'config', 'calibration', 'system')
+    add('--library', type=input_file, metavar='FILE',
+        help='library of codebooks that the network has used')
     add('--model', type=input_file, metavar='FILE', help='model of the estimator neural')
     add('--site', type=input_file, metavar='FILE',
         help='site file; by default the recorded scenarios of the surfaces')

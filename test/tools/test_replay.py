@@ -15,6 +15,7 @@ from rclpy.node import Node
 from ros_messages import from_ros
 
 from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.codebook.library import Library, Plan
 from rhs_isac_ros.model import Pose, Scenario, simulate_received
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
@@ -96,6 +97,22 @@ def test_a_copy_by_another_program_has_the_same_table(run, capsys, tmp_path, cop
             assert main([*map(str, arguments)]) == 0
             tables.append(capsys.readouterr().out)
     assert len({*tables}) == 1
+
+
+def test_codebooks_of_a_library_are_read_from_its_file(run, capsys, tmp_path):
+    scenario = Scenario.from_yaml(CONFIG / 'quick.yaml')
+    codebook = Codebook.load(CONFIG / 'codebook_quick.yaml', scenario)
+    plan = Plan(scenario.unplaced.id, codebook.id, 'error', (1.0,), (100.0,))
+    Library.of(plan, plan.cells(scenario), [codebook]).save(tmp_path / 'library.npz')
+    path = filtered(run.path, lambda topic, _: topic != '/codebook')
+    arguments = [str(path), '--config', str(CONFIG / 'quick.yaml')]
+    assert main(arguments) == 2
+    assert 'not in the recording; give its file' in capsys.readouterr().err
+    tables = []
+    for more in ([str(run.path)], [*arguments, '--library', str(tmp_path / 'library.npz')]):
+        assert main(more) == 0
+        tables.append(capsys.readouterr().out)
+    assert tables[0] == tables[1]
 
 
 @pytest.mark.parametrize('time_of', [
