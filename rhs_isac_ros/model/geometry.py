@@ -160,7 +160,7 @@ def to_positions(points: np.ndarray) -> np.ndarray:
 def to_polar(positions: np.ndarray) -> np.ndarray:
     """Convert positions with x > 0, float64 [..., 3] [m], to (r [m], u, v), float64 [..., 3]."""
     points = np.empty(positions.shape)
-    range_m = np.sqrt(np.sum(positions * positions, axis=-1, keepdims=True))
+    range_m = np.sqrt(np.einsum('...p,...p->...', positions, positions))[..., None]
     points[..., :1], points[..., 1:] = range_m, positions[..., 1:] / range_m
     return points
 
@@ -185,7 +185,7 @@ def polar_derivative(points: np.ndarray) -> np.ndarray:
     Returns float64 [N, 3, 3]: rows r, u and v, columns x, y and z, the inverse of `jacobian`.
     """
     matrix, cosines = np.empty((len(points), 3, 3)), points[:, 1:]
-    matrix[:, 0, 0] = np.sqrt(np.maximum(1 - np.sum(cosines * cosines, axis=1), 0.0))
+    matrix[:, 0, 0] = np.sqrt(np.maximum(1 - np.einsum('na,na->n', cosines, cosines), 0.0))
     matrix[:, 0, 1:] = cosines
     matrix[:, 1:] = (_ACROSS - cosines[:, :, None] * matrix[:, :1]) / points[:, :1, None]
     return matrix

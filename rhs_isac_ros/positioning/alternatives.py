@@ -312,7 +312,8 @@ class _Templates:
         bound, _ = _best_gain(prior, np.zeros_like(rest), rest, n)
         shot, direction = np.nonzero(bound >= bound.max(axis=1, keepdims=True) - GRID.margin)
         of_shot, energy = Segments.of_keys(shot), energy[shot, None]
-        arguments = filtered[shot, :, :, direction][..., self._index].swapaxes(0, 1)
+        by_node = filtered[shot, :, :, direction].swapaxes(0, 1)
+        arguments = by_node.take(self._index, axis=2)
         arguments *= self._scale[:, 0]
         # A Bessel function I_0(x) is at most exp(x), and its logarithm is convex. So few places
         # need its value.
@@ -325,13 +326,15 @@ class _Templates:
         mean = of_shot.max(total.max(axis=1)) / len(arguments)
         least = of_shot.max(highest.max(axis=1)) - GRID.margin - len(arguments) * (
             mean - log_bessel(mean))
-        pair, place = np.nonzero(highest >= of_shot.repeat(least)[:, None])
-        arguments, shot = arguments[:, pair, place], shot[pair]
-        logs = highest[pair, place] + np.sum(log_bessel(arguments) - arguments, axis=0)
+        (chosen,) = (highest >= of_shot.repeat(least)[:, None]).ravel().nonzero()
+        arguments = arguments.reshape(len(arguments), -1).take(chosen, axis=1)
+        pair = chosen // highest.shape[1]
+        shot = shot[pair]
+        logs = highest.take(chosen) + np.sum(log_bessel(arguments) - arguments, axis=0)
         if prior.gain_std:
             # Laplace's integral over the gain, which hardly changes the Bessel functions.
-            power = np.exp(-2 * gain[pair, place]) * energy[pair, 0]
-            logs -= np.log(4 * power - total[pair, place] + prior.gain_std**-2) / 2 + math.log(
+            power = np.exp(-2 * gain.take(chosen)) * energy[pair, 0]
+            logs -= np.log(4 * power - total.take(chosen) + prior.gain_std**-2) / 2 + math.log(
                 prior.gain_unit)
         largest = np.maximum(Segments.of_keys(shot).max(logs), np.finfo(float).min)
         with np.errstate(divide='ignore'):

@@ -147,7 +147,7 @@ class TemplateTable:
         if not prior.is_coarse:
             step, value = self._step(query, peaks, points, values)
             points = points + step
-        curvature = self.cells.curvature[peaks.cell]
+        curvature = self.cells.curvature.take(peaks.cell, axis=0)
         # Moving a point into the region lowers its likelihood.
         inside = move_inside(points, curvature, self._resolution.bounds_m)
         value = value - likelihood_loss(inside - points, curvature)
@@ -179,24 +179,26 @@ class TemplateTable:
         is_likely[shots, first] = False
         drawn = {}
         if draw:
-            many = np.count_nonzero(is_likely, axis=1) > _LIMITS.searched_cells
-            weak = np.flatnonzero(many & (best <= _LIMITS.drawn_likelihood)).tolist()
-            drawn = {shot: fit for shot in weak if (fit := draw(query, shot)) is not None}
+            (weak,) = (best <= _LIMITS.drawn_likelihood).nonzero()
+            many = is_likely[weak].sum(axis=1) > _LIMITS.searched_cells
+            drawn = {shot: fit for shot in weak[many].tolist()
+                     if (fit := draw(query, shot)) is not None}
+        if drawn:
             is_likely[[*drawn]] = False
             peaks = select(peaks, ~np.isin(peaks.shots, [*drawn]))
         others, cells = np.nonzero(is_likely)
         if len(others):
             peaks = concatenate(peaks, self._peaks_in(others, cells, query))
+        (kept,) = (peaks.value + loss[peaks.cell] >= limit[peaks.shots, peaks.cell]).nonzero()
+        kept = kept[np.lexsort((-peaks.value[kept], peaks.shots[kept]))]
         peaks = select(
-            peaks, peaks.value + loss[peaks.cell] >= limit[peaks.shots, peaks.cell])
-        peaks = select(peaks, np.lexsort((-peaks.value, peaks.shots)))
-        peaks = select(peaks, Segments.of_keys(peaks.shots).places < _LIMITS.peaks)
+            peaks, kept[Segments.of_keys(peaks.shots[kept]).places < _LIMITS.peaks])
         radii = self._resolution.separation(query.prior.is_coarse)
         return select(peaks, separate(peaks.shots, self._points(peaks), radii)), drawn
 
     def _points(self, peaks: Peaks) -> np.ndarray:
         """Return the points (r [m], u, v) of peaks, float64 [P, 3]."""
-        points: np.ndarray = self.grid.nodes[self.grid.node[peaks.cell]]
+        points: np.ndarray = self.grid.nodes.take(self.grid.node[peaks.cell], axis=0)
         points[:, 0] = peaks.range_m
         return points
 
@@ -268,7 +270,7 @@ class TemplateTable:
         """
         cells, range_m, centre_m = self.cells, points[:, 0], peaks.centre_m
         outputs, at_point, slopes = self._outputs(query, peaks, range_m)
-        turns, at_window = (np.moveaxis(turns_at(self._wavenumbers, at_m), 2, 0)
+        turns, at_window = (turns_at(self._wavenumbers, at_m).transpose(2, 0, 1)
                             for at_m in (range_m, centre_m))
         # The value of a peak was computed with the delays of the centre of its window. It also
         # contains priors and, with an unknown gain, the energy of the signals, so only the part
@@ -294,7 +296,7 @@ class TemplateTable:
         change = (np.minimum(exact + np.sum(gradient * step, axis=1) / 2, most)
                   - np.minimum(approximate, most))
         limits = self._resolution.step_limits(query.prior.is_coarse)
-        return np.clip(step, -limits, limits), peaks.value + change
+        return np.minimum(np.maximum(step, -limits), limits), peaks.value + change
 
     def _outputs(self, query: Query, peaks: Peaks, range_m: np.ndarray
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -304,12 +306,9 @@ class TemplateTable:
         template, and those with the curvature at the given ranges. The derivatives of the latter
         are [P, N_B, N_SB, 3].
         """
-        n_nodes, nodes = len(self.grid.nodes), self.grid.node[peaks.cell]
-        # Many peaks of a shot have the same template.
-        used, index = np.unique(peaks.shots * n_nodes + nodes, return_inverse=True)
-        shot, node = np.divmod(used, n_nodes)
-        slopes = np.einsum('iskqf,kisf->kisq', self.filters.slopes[:, :, node],
-                           query.signals[shot])[index]
+        nodes = self.grid.node[peaks.cell]
+        slopes = np.einsum('iskqf,kisf->kisq', self.filters.slopes.take(nodes, axis=2),
+                           query.signals.take(peaks.shots, axis=0))
         outputs, node_m = query.outputs[peaks.shots, :, :, nodes], self.grid.nodes[nodes, 0]
         ratio = node_m / range_m
         # Linear in 1 / r, as in `evaluate_windows`.
@@ -327,7 +326,7 @@ def heaviest(of_shot: Segments, value: np.ndarray, margin: float | np.ndarray) -
     relative = value - of_shot.repeat(of_shot.first(value))
     total = of_shot.sum(np.exp(relative))
     # Within a shot, no later point is heavier.
-    n_left = of_shot.repeat(of_shot.counts) - of_shot.places
+    n_left = of_shot.repeat(of_shot.ends) - np.arange(len(value))
     return relative + np.log(n_left) > of_shot.repeat(np.log(total)) - margin
 
 
@@ -343,11 +342,9 @@ def _near(shots: np.ndarray, scaled: np.ndarray, reach: float
         moved = scaled.copy()
         moved[:, 0] += shots * (2 * reach + np.ptp(scaled[:, 0]))
         first, last = cKDTree(moved).query_pairs(reach, output_type='ndarray').T
-    squares = np.zeros(len(first))
-    for values in scaled.T:
-        offsets = values[last] - values[first]
-        squares += offsets * offsets
-    near = np.flatnonzero((squares <= reach**2) & (shots[first] == shots[last]))
+    offsets = scaled.take(last, axis=0) - scaled.take(first, axis=0)
+    squares = np.einsum('kp,kp->k', offsets, offsets)
+    (near,) = ((squares <= reach**2) & (shots[first] == shots[last])).nonzero()
     return first[near], last[near], squares[near]
 
 
@@ -373,9 +370,10 @@ def separate(shots: np.ndarray, points: np.ndarray, radii: np.ndarray,
         shots, points / radii, 1.0 if curvature is None else _LIMITS.reach)
     if curvature is not None:
         offset, close = (points[worse] - points[better])[:, :3], squares < 1
-        close |= np.einsum('kp,kpq,kq->k', offset, curvature[worse], offset) < _LIMITS.same_mode
+        close |= 2 * likelihood_loss(
+            offset, curvature.take(worse, axis=0)) < _LIMITS.same_mode
         worse, better = worse[close], better[close]
-    previous = ~chosen
+    previous = chosen if not len(worse) else ~chosen
     # A point depends only on better points, so each round settles at least one more. A few rounds
     # suffice.
     while (chosen != previous).any():

@@ -113,7 +113,9 @@ class Resolution(NamedTuple):
     def _radii(self, is_coarse: bool, wavelengths: float, radians: float) -> np.ndarray:
         range_m = (_LIMITS.coarse_bins * self.bin_width_m(self.nearest_m) if is_coarse
                    else wavelengths * self.wavelength_m)
-        return np.array([range_m, *radians * self.direction])
+        radii = np.empty(3)
+        radii[0], radii[1:] = range_m, radians * self.direction
+        return radii
 
     @property
     def curvature_floor(self) -> np.ndarray:

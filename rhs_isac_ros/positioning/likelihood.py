@@ -224,7 +224,8 @@ class WhiteMeans:
         prior, whitened = self.likelihood.nuisance, self._whitened(values, signals)
         slopes = self.slopes.reshape(*self.slopes.shape[:2], self.mean[0].size)
         n_moving = prior.velocity.shape[1]
-        by_point, by_velocity = np.split(slopes, [slopes.shape[1] - n_moving], axis=1)
+        n_points = slopes.shape[1] - n_moving
+        by_point, by_velocity = slopes[:, :n_points], slopes[:, n_points:]
         by_values = observed = slopes[:, :0]
         if len(prior):
             by_values, observed = prior.slopes(whitened, self.mean)
@@ -296,15 +297,19 @@ def assemble(prior: NuisancePrior, values: np.ndarray, columns: Columns,
     parts = np.ascontiguousarray(columns.residual).view(float)
     gradient = 2 * np.matmul(
         np.ascontiguousarray(slopes).view(float), parts[..., None])[..., 0]
-    energy = np.sum(parts**2, axis=1)
+    energy = np.einsum('mp,mp->m', parts, parts)
+    value = -energy
     # The priors of point, parameters and further parameters.
-    information += np.diag(np.concatenate([
-        prior.floor[:first], prior.precision, np.ones(n_linear)]))
-    gradient[:, first:n] -= prior.precision * values + prior.volume
-    # Derivatives of parameters that move the multipath already include this information.
-    still = ~prior.moves_multipath
-    information[:, first:n, first:n] += np.outer(still, still) * information_of_covariance
-    value = prior.log_prior(values) - energy
+    diagonal = np.einsum('mpp->mp', information)
+    diagonal[:, :first] += prior.floor[:first]
+    diagonal[:, n:] += 1.0
+    if len(prior):
+        diagonal[:, first:n] += prior.precision
+        gradient[:, first:n] -= prior.precision * values + prior.volume
+        # Derivatives of parameters that move the multipath already include this information.
+        still = ~prior.moves_multipath
+        information[:, first:n, first:n] += np.outer(still, still) * information_of_covariance
+        value += prior.log_prior(values)
     if noise is not None:
         # By the share of noise, a gain scales the covariance less, and so does the density.
         by_band = (len(values), *prior.gains.shape[:1], -1)
@@ -315,6 +320,8 @@ def assemble(prior: NuisancePrior, values: np.ndarray, columns: Columns,
         value += 2 * np.log(weights).sum(axis=1)
         gradient[:, first:n] += 2 * surplus @ prior.gains
         information[:, first:n, first:n] += np.einsum('bq,mb,bp->mqp', gains, lost, gains)
+    if not n_linear:
+        return Local(value, gradient, information, energy)
     marginal = marginalise(information, gradient, n)
     rise = np.sum(gradient[:, n:] * marginal.offset, axis=1) / 2
     return Local(value + rise + marginal.log_volume, marginal.gradient, marginal.information,

@@ -167,9 +167,9 @@ def _over_gain(doubled: np.ndarray, candidates: Candidates, query: Query
 
     Returns the log-likelihood and the gain [nepers], [S, W]; the former overwrites `doubled`.
     """
-    gain = np.broadcast_to(0.0, doubled.shape)
+    gain = np.zeros(doubled.shape)
     if query.prior.gain_std:
-        gain, n_measurements = np.zeros_like(doubled), query.signals[0].size
+        n_measurements = query.signals[0].size
         for part in Segments.of_keys(candidates.shots).slices:
             energy = float(query.energies[candidates.shots[part.start]])
             doubled[:, part], gain[:, part] = query.prior.maximised_over_gain(

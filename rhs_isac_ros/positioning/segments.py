@@ -10,14 +10,21 @@ _Rows = TypeVar('_Rows', bound=tuple[np.ndarray, ...])
 
 
 def select(rows: _Rows, chosen: Any) -> _Rows:
-    """Select rows of a named tuple of arrays by their indices or by a mask."""
+    """Select rows of a named tuple of arrays by a slice, by their indices or by a mask."""
     kind: Any = type(rows)
-    return kind._make([field[chosen] for field in rows])
+    if isinstance(chosen, slice):
+        return kind._make([field[chosen] for field in rows])
+    # This is several times as fast as an index of an array with several dimensions.
+    chosen = np.asarray(chosen)
+    places = chosen.nonzero()[0] if chosen.dtype == bool else chosen
+    return kind._make([field.take(places, axis=0) for field in rows])
 
 
 def concatenate(*parts: _Rows) -> _Rows:
     """Concatenate the fields of named tuples of arrays."""
     kind: Any = type(parts[0])
+    if len(parts) == 1:
+        return parts[0]
     return kind._make(map(np.concatenate, zip(*parts, strict=True)))
 
 
@@ -40,7 +47,7 @@ class Segments(NamedTuple):
         """Return the segments of rows with equal keys [M], which are in ascending order."""
         is_edge = np.ones(len(keys) + 1, bool)
         np.not_equal(keys[1:], keys[:-1], out=is_edge[1:-1])
-        edges = np.flatnonzero(is_edge)
+        (edges,) = is_edge.nonzero()
         return cls(edges[:-1], edges[1:] - edges[:-1])
 
     @classmethod
@@ -68,7 +75,7 @@ class Segments(NamedTuple):
     @property
     def places(self) -> np.ndarray:
         """Number of rows before each row in its segment, int [M]."""
-        return np.arange(self.counts.sum()) - self.repeat(self.starts)
+        return np.arange(int(self.counts.sum())) - self.repeat(self.starts)
 
     def sum(self, values: np.ndarray) -> np.ndarray:
         """Add up values of the rows, [M, ...], in each segment, [N, ...]."""
@@ -84,4 +91,4 @@ class Segments(NamedTuple):
 
     def repeat(self, values: np.ndarray) -> np.ndarray:
         """Repeat a value of each segment, [N, ...], for each of its rows, [M, ...]."""
-        return np.repeat(values, self.counts, axis=0)
+        return values.repeat(self.counts, axis=0)

@@ -257,25 +257,23 @@ class Inside(NamedTuple):
             log_values = np.zeros(len(points))
         positions = pose.vectors_to_site(to_positions(points))
         derivative = polar_derivative(points) @ pose.rotation.T
-        transposed = np.swapaxes(derivative, 1, 2)
-        low, high = (np.broadcast_to(limit, points.shape) for limit in bounds - pose.origin)
+        transposed = derivative.transpose(0, 2, 1)
+        low, high = limits = np.empty((2, *points.shape))
+        limits[:] = (bounds - pose.origin).reshape(2, -1, 3)
         extent = high - low
-        # Metres per unit of r, u and v.
-        metres = np.repeat(points[:, :1], 3, axis=1)
-        metres[:, 0] = 1.0
-        known = np.sqrt(curvature.diagonal(axis1=1, axis2=2)) / metres
-        widening = 1 / np.maximum(
-            known * _LIMITS.exact * np.linalg.norm(extent, axis=1)[:, None], 1.0)
+        known = np.sqrt(curvature.diagonal(axis1=1, axis2=2))
+        known[:, 1:] /= points[:, :1]  # In standard deviations per metre.
+        diagonal_m = np.sqrt(np.einsum('mp,mp->m', extent, extent))
+        widening = 1 / np.maximum(known * _LIMITS.exact * diagonal_m[:, None], 1.0)
         gradient = widening * gradient
         curvature = widening[:, :, None] * curvature * widening[:, None]
         precision = np.matmul(np.matmul(transposed, curvature), derivative)
-        smallest = _LIMITS.extent * extent.max(axis=1)[:, None]
-        precision += 12 * _LIMITS.floor / np.maximum(extent, smallest)[..., None]**2 * np.eye(3)
+        smallest = _LIMITS.extent * extent.max(axis=1, keepdims=True)
+        np.einsum('mpp->mp', precision)[:] += 12 * _LIMITS.floor / np.maximum(extent, smallest)**2
         centre = positions + step_to_maximum(
             precision, np.matmul(transposed, gradient[..., None])[..., 0])
-        known = np.diagonal(precision, axis1=1, axis2=2)
-        order = np.argsort(untied(extent * np.sqrt(known)), axis=1, kind='stable')
-        rows = np.arange(len(points))[:, None]
+        known = precision.diagonal(axis1=1, axis2=2)
+        order = untied(extent * np.sqrt(known)).argsort(axis=1, kind='stable')
         wide = _is_wide(points, curvature, extent)
         if wide.any():
             # The last axis follows the sphere, even if directions determine another better.
@@ -283,11 +281,13 @@ class Inside(NamedTuple):
             last = np.argmax(untied(extent * np.sqrt(by_range)), axis=1)
             kept = order != last[:, None]
             order[wide] = np.column_stack([order[kept].reshape(-1, 2), last])[wide]
+        # Places of the ordered axes in flat arrays, which `take` reads faster than an index.
+        axes = order + 3 * np.arange(len(points))[:, None]
         return cls._in_order(
-            (pose, log_values, points, gradient, curvature), order, low[rows, order],
-            high[rows, order], centre[rows, order],
-            precision[rows[..., None], order[:, :, None], order[:, None]],
-            derivative[:, 0][rows, order], wide)
+            (pose, log_values, points, gradient, curvature), order, low.take(axes),
+            high.take(axes), centre.take(axes),
+            precision.take(3 * axes[:, :, None] + order[:, None]),
+            derivative[:, 0].take(axes), wide)
 
     @classmethod
     def _in_order(
@@ -296,8 +296,8 @@ class Inside(NamedTuple):
     ) -> 'Inside':
         # With the axes reversed, the Cholesky factor contains the conditional distributions.
         root = np.linalg.cholesky(precision[:, ::-1, ::-1])[:, ::-1, ::-1]
-        std = 1 / np.diagonal(root, axis1=1, axis2=2)
-        coupling = np.swapaxes(root, 1, 2) * std[:, :, None]
+        std = 1 / root.diagonal(axis1=1, axis2=2)
+        coupling = root.transpose(0, 2, 1) * std[:, :, None]
         return cls._make((*gaussians, order, low, high, centre, precision, std, coupling,
                           direction, wide))
 
@@ -493,8 +493,8 @@ def _is_wide(points: np.ndarray, curvature: np.ndarray, extent: np.ndarray) -> n
     This is so for a board with a single row or column of elements. The region then contains a
     large part of the sphere, which no plane approximates.
     """
-    least = np.diagonal(curvature, axis1=1, axis2=2)[:, 1:].min(axis=1)
-    limit_m2 = _LIMITS.wide**2 * np.sum(extent**2, axis=1)
+    least = np.minimum(curvature[:, 1, 1], curvature[:, 2, 2])
+    limit_m2 = _LIMITS.wide**2 * np.einsum('mp,mp->m', extent, extent)
     wide: np.ndarray = points[:, 0]**2 > limit_m2 * least
     return wide
 
