@@ -251,7 +251,7 @@ def test_a_scenario_of_another_version_is_an_error(tmp_path):
 @pytest.mark.parametrize(('text', 'reason'), [
     ('n_frames: [&a [1, 1], &b [*a, *a]]', 'it contains references'),
     (f'n_frames: [{2**19 * "1,"}]', 'it contains references, or is too long'),
-    (10_000 * '[', 'nested more than 16 times')])
+    (10_000 * '[', 'nested more than 16 times')], ids=['references', 'long', 'nested'])
 def test_a_scenario_that_would_occupy_the_process_is_an_error(
         tmp_path, monkeypatch, text, reason):
     monkeypatch.setattr(yaml, 'safe_dump', lambda changes: text)
