@@ -40,6 +40,9 @@ class _Sampling(NamedTuple):
     # because the average over the range nearly removes the effect of this phase.
     spacing: float = 1.5
     common: int = 8
+    # Powers that flatten weights: ratio of successive ones, and largest number of them.
+    flatter: float = 0.8
+    powers: int = 40
     # Largest standard deviation of a wrapped phase: it is nearly uniform, and one wrap suffices.
     # Smallest one: with phases that are known better, few samples would carry the weight.
     phase_std_rad: float = 3.0
@@ -68,14 +71,24 @@ class Samples(NamedTuple):
         Takes log-weights [M, S], and the shots of the modes, int [M]. Given n independent samples
         of a Gaussian with D unknown coordinates, one more sample has a Student distribution, whose
         covariance is (n + 1) / (n - D - 2) times theirs. `n_fitted` is D + 2, or 0 for points that
-        represent the covariance well; n is the effective number of samples.
+        represent the covariance well; n is the effective number of samples. The covariance of a
+        few samples may be arbitrarily small: if n is below twice `n_fitted`, the weights are
+        raised to the power with which it is not.
         """
         of_shot = Segments.of_keys(shots)
         highest = of_shot.max(log_weights.max(axis=1))
-        weights = np.exp(log_weights - of_shot.repeat(highest)[:, None])
-        totals = of_shot.sum(weights.sum(axis=1))
-        weights /= of_shot.repeat(totals)[:, None]
-        n = np.maximum(1 / of_shot.sum(np.einsum('ms,ms->m', weights, weights)), n_fitted + 1)
+        relative = log_weights - of_shot.repeat(highest)[:, None]
+        totals = of_shot.sum(np.exp(relative).sum(axis=1))
+        powers = np.ones(len(totals))
+        for _ in range(_SAMPLING.powers):
+            weights = np.exp(relative * of_shot.repeat(powers)[:, None])
+            weights /= of_shot.repeat(of_shot.sum(weights.sum(axis=1)))[:, None]
+            n = 1 / of_shot.sum(np.einsum('ms,ms->m', weights, weights))
+            scarce = n < 2 * n_fitted
+            if not scarce.any():
+                break
+            powers[scarce] *= _SAMPLING.flatter
+        n = np.maximum(n, n_fitted + 1)
         return cls(positions, weights, of_shot,
                    highest + np.log(totals) - np.log(log_weights.shape[1]),
                    (1 + n_fitted) / (n - n_fitted))

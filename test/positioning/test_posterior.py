@@ -153,6 +153,23 @@ def test_covariances_of_few_samples_cover_another_one(size):
     assert squares.mean() == pytest.approx(size, rel=0.04)
 
 
+def test_no_covariance_is_that_of_a_few_samples():
+    """If one sample has all the weight, others count until the covariance is known."""
+    positions = np.random.default_rng(4).standard_normal((3, 128, 6))
+    log_weights = np.zeros((3, 128))
+    log_weights[0, 0], log_weights[1, :100] = 50.0, -3.0
+    shots = np.arange(3)
+    samples = Samples.of(positions, log_weights, shots, n_fitted=8)
+    n = 1 / np.sum(samples.weights**2, axis=1)
+    assert 16 <= n[0] < 30
+    _, covariances = samples.moments()
+    assert np.linalg.eigvalsh(covariances[0]).min() > 0.5
+    # Others keep their weights, and all their evidence.
+    plain = Samples.of(positions, log_weights, shots)
+    np.testing.assert_allclose(samples.weights[1:], plain.weights[1:])
+    np.testing.assert_allclose(samples.log_evidence, plain.log_evidence)
+
+
 @pytest.mark.slow
 def test_random_phases_of_the_bands_leave_the_moments_of_the_posterior(random_beams):
     """The modes extend over the range and overlap."""
