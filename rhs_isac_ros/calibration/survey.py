@@ -235,9 +235,12 @@ def _most_likely(scenario: Scenario, model: MeasurementModel, samples: np.ndarra
         return dataclasses.replace(
             scenario, **dict(zip(FIELDS, (level, np.exp(delay), np.exp(angle)), strict=True)))
 
+    # The fields change no errors of the direct path, which take most of the time.
+    direct = model.covariance() - model.covariance_in_shadow()
+
     def cost(point: np.ndarray) -> float:
-        covariance = MeasurementModel(
-            declaring(point), model.beams, model.surface).covariance()
+        covariance = direct + MeasurementModel(
+            declaring(point), model.beams, model.surface).covariance_in_shadow()
         return -_log_evidence(covariance, samples, n, float(np.exp(np.clip(point, low, high)[3])))
 
     # The level follows from the power, at least if the noise is weak.
