@@ -101,6 +101,7 @@ def test_both_views_show_region_users_and_ellipses_at_their_positions():
     assert [text.get_text() for text in figure.texts] == ['cycle 103, user 3, codebook cb']
 
 
+@pytest.mark.slow
 def test_region_surface_and_lobe_are_where_the_surface_hangs():
     # At y = 12 m, looking along -y.
     scenario = Scenario(pose={'position_m': [1, 12, 2], 'quaternion': [0, 0, -1, 1]})
@@ -121,6 +122,7 @@ def test_region_surface_and_lobe_are_where_the_surface_hangs():
             assert 1.0 < np.ptp(lobe.get_xy()[:, 1]) and lobe.get_xy()[:, 1].max() < 12.001
 
 
+@pytest.mark.slow
 def test_title_beam_and_lobe_are_of_one_user():
     """Even if the estimate of another user is more recent than the beam."""
     scenario = Scenario()
