@@ -60,8 +60,9 @@ class ProjectedModel(MeasurementModel):
         n_columns = n_dimensions + 1
         weights = interpolation(full.scenario, ends_m, max_error)
         n_nodes = weights.shape[1]
+        # The whitening contains the multipath; a measured one would not fit other sub-bands.
         self.scenario = dataclasses.replace(
-            full.scenario, n_subbands=n_nodes, n_frames=n_columns,
+            full.scenario, n_subbands=n_nodes, n_frames=n_columns, multipath=None,
             subband_spacing_hz=full.scenario.bandwidth_hz / n_nodes)
         unit = np.tile(np.eye(n_columns, dtype=complex), (n_bands, 1, 1))
         self.combined_root = self.combined_whitener = unit

@@ -185,6 +185,17 @@ def test_templates_have_the_covariance_of_their_state(failing):
     assert found == pytest.approx(expected + state.offset, abs=0.02)
 
 
+def test_templates_outside_fit_a_measured_multipath(pytestconfig):
+    """They have other sub-bands than the survey."""
+    hall = Scenario.from_yaml(pytestconfig.rootpath / 'config' / 'hall.yaml')
+    _, received = System(hall, Codebook.default()).pairs(4, seed=2)
+    inside, anywhere = (
+        make_estimator('bayes', hall, Codebook.default(), reject_outside=rejects).estimate(received)
+        for rejects in (False, True))
+    np.testing.assert_array_equal(anywhere.mean, inside.mean)
+    assert np.isfinite(anywhere.outside_probability).all()
+
+
 @pytest.mark.parametrize('change, n', [
     ({'failed_element_share': 0.01}, 2), ({'timing_std_s': 1e-7}, 16)], ids=['failures', 'timing'])
 def test_neither_failures_nor_offsets_explain_users_elsewhere(change, n, pytestconfig):
