@@ -187,10 +187,11 @@ def test_templates_have_the_covariance_of_their_state(failing):
 
 def test_templates_outside_fit_a_measured_multipath(pytestconfig):
     """They have other sub-bands than the survey."""
-    hall = Scenario.from_yaml(pytestconfig.rootpath / 'config' / 'hall.yaml')
-    _, received = System(hall, Codebook.default()).pairs(4, seed=2)
+    hall, codebook = Scenario.from_yaml(
+        pytestconfig.rootpath / 'config' / 'hall.yaml'), Codebook.default()
+    _, received = System(hall, codebook).pairs(4, seed=2)
     inside, anywhere = (
-        make_estimator('bayes', hall, Codebook.default(), reject_outside=rejects).estimate(received)
+        make_estimator('bayes', hall, codebook, reject_outside=rejects).estimate(received)
         for rejects in (False, True))
     np.testing.assert_array_equal(anywhere.mean, inside.mean)
     assert np.isfinite(anywhere.outside_probability).all()
