@@ -219,7 +219,7 @@ def _phasors(phases: np.ndarray) -> np.ndarray:
     nearest = np.rint(turns)
     rest = (turns - nearest) * (2 * np.pi / _N_PHASORS)
     square = rest * rest
-    phasors = _TABLE[nearest.astype(np.intp) & (_N_PHASORS - 1)]
+    phasors = _TABLE.take(nearest.astype(np.intp) & (_N_PHASORS - 1))
     rotation = np.empty(phases.shape, complex)
     rotation.real = 1 - square * (0.5 - square * (1 / 24))
     rotation.imag = rest * (1 - square * (1 / 6 - square * (1 / 120)))

@@ -21,7 +21,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import blocks
+from rhs_isac_ros.model.arrays import blocks, marked
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_bessel, log_evidence_of_level
 from rhs_isac_ros.model.geometry import element_positions, to_positions
@@ -310,7 +310,7 @@ class _Templates:
         explained = (np.sum(filtered, axis=1)**2 / self._node_energy).max(axis=1)
         rest = np.maximum(energy[:, None] - explained, n * _MIN_PROBABILITY)
         bound, _ = _best_gain(prior, np.zeros_like(rest), rest, n)
-        shot, direction = np.nonzero(bound >= bound.max(axis=1, keepdims=True) - GRID.margin)
+        shot, direction = marked(bound >= bound.max(axis=1, keepdims=True) - GRID.margin)
         of_shot, energy = Segments.of_keys(shot), energy[shot, None]
         by_node = filtered[shot, :, :, direction].swapaxes(0, 1)
         arguments = by_node.take(self._index, axis=2)

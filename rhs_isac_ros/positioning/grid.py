@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.arrays import read_only
+from rhs_isac_ros.model.arrays import marked, read_only
 from rhs_isac_ros.model.gaussian import likelihood_loss
 from rhs_isac_ros.positioning.estimate import Fit
 from rhs_isac_ros.positioning.lattice import (
@@ -186,7 +186,7 @@ class TemplateTable:
         if drawn:
             is_likely[[*drawn]] = False
             peaks = select(peaks, ~np.isin(peaks.shots, [*drawn]))
-        others, cells = np.nonzero(is_likely)
+        others, cells = marked(is_likely)
         if len(others):
             peaks = concatenate(peaks, self._peaks_in(others, cells, query))
         (kept,) = (peaks.value + loss[peaks.cell] >= limit[peaks.shots, peaks.cell]).nonzero()
@@ -232,9 +232,10 @@ class TemplateTable:
         shots, cells, range_m = shots[row], cells[row], self._range_windows.range_m[window]
         # Complex64 [W, N_B, N_SB], then the outputs of the bands, [N_B, W].
         by_subband = query.outputs[shots, :, :, self.grid.node[cells]]
-        of_band = np.einsum('wis,isw->iw', by_subband, self._range_windows.turns[:, :, window])
+        of_band = np.einsum(
+            'wis,isw->iw', by_subband, self._range_windows.turns.take(window, axis=2))
         energy = self.cells.template_energy_at(cells, range_m)
-        margin = (query.margin + self.cells.loss)[cells]
+        margin = (query.margin + self.cells.loss).take(cells)
         return self._finder.find(
             Candidates(shots, cells, range_m, of_band, energy, margin), query)
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model.arrays import marked
 from rhs_isac_ros.positioning.lattice import Grid
 from rhs_isac_ros.positioning.segments import Segments, select
 from rhs_isac_ros.positioning.templates import Query, turns_at
@@ -110,7 +111,8 @@ class PeakFinder:
         step, window = _inner_maxima(
             along, candidates.energy, Segments.of_keys(candidates.shots))
         # The vertex of a parabola through a maximum and the steps beside it.
-        before, highest, after = (along[step + side, window] for side in (-1, 0, 1))
+        before, highest, after = (
+            along.take((step + side) * along.shape[1] + window) for side in (-1, 0, 1))
         slope, bend = (after - before) / 2, 2 * highest - after - before
         change = slope / np.maximum(bend, np.abs(slope) + 1e-9)
         found = select(candidates._replace(outputs=candidates.outputs.T), window)
@@ -147,7 +149,7 @@ def _inner_maxima(along: np.ndarray, energy: np.ndarray, of_shot: Segments
     for rows in select(of_shot, lacking).slices:
         values = inner[:, rows] - energy[rows]
         is_peak[:, rows][np.unravel_index(values.argmax(), values.shape)] = True
-    step, window = np.nonzero(is_peak)
+    step, window = marked(is_peak)
     order = np.argsort(window, kind='stable')
     return step[order] + 1, window[order]
 
