@@ -145,8 +145,12 @@ def watch(
             if time.monotonic() - changed_s > _CYCLE_TIMEOUT_S:
                 # In a site, the name of the leading surface precedes that of the role.
                 (name,) = (name for name in processes.names if name.endswith('bs'))
-                return (f'no cycle within {_CYCLE_TIMEOUT_S:.0f} s; log of the base station:\n'
-                        f'{processes.log(name)}')
+                warnings = [line for other in processes.names if other != name
+                            for line in processes.log(other).splitlines()
+                            if '[WARN]' in line or '[ERROR]' in line]
+                return '\n'.join([
+                    f'no cycle within {_CYCLE_TIMEOUT_S:.0f} s; log of the base station, and '
+                    'warnings of others:', processes.log(name), *warnings])
     return ''
 
 

@@ -2,7 +2,9 @@
 
 import dataclasses
 import signal
+import types
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -182,3 +184,13 @@ def test_the_report_of_a_site_has_the_errors_of_each_surface_and_the_handovers(
         'side: 2 positions, root mean square error 2.000 m',
         'fused: 3 positions, root mean square error 0.500 m',
         'data: 2 over front, 1 over side; 1 handover']
+
+
+def test_without_a_cycle_the_error_shows_the_warnings_of_all_nodes(monkeypatch):
+    logs = {'bs': '[INFO] [bs]: waiting for positioner', 'channel': '[INFO] [channel]: serving',
+            'positioner': '[INFO] [positioner]: begun\n[WARN] [positioner]: no estimator'}
+    processes = types.SimpleNamespace(names=tuple(logs), ended=dict, log=logs.get)
+    monkeypatch.setattr(demo, '_CYCLE_TIMEOUT_S', 0.0)
+    monkeypatch.setattr(demo, 'EventsExecutor', mock.MagicMock())
+    error = demo.watch(types.SimpleNamespace(complete=[]), processes, 1, lambda *_: None)
+    assert error.splitlines()[1:] == [logs['bs'], '[WARN] [positioner]: no estimator']
