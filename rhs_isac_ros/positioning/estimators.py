@@ -150,8 +150,7 @@ class SearchEstimator(abc.ABC):
         # is due to the level.
         self._level, self._n_measurements = 10**(median_db / 10), n_measurements
         self._level_share = share_of_level(n_measurements, std_db)
-        self._test = FitTest(
-            n_measurements, self._level, likelihood.scenario.board.declared)
+        self._test = FitTest(n_measurements, self._level, likelihood.scenario.board.declared)
         self._movement = MovementTest.of(system, likelihood)
         self._bounds = likelihood.resolution.bounds_m
         self._prior_m2 = float(np.sum((self._bounds[1] - self._bounds[0])**2)) / 12
@@ -181,8 +180,7 @@ class SearchEstimator(abc.ABC):
     def _region(self) -> SearchScope:
         """The whole region."""
         scenario = self._likelihood.scenario
-        scope = SearchScope.of(
-            self._likelihood, self._load(), lay_grid(scenario), self._blocked)
+        scope = SearchScope.of(self._likelihood, self._load(), lay_grid(scenario), self._blocked)
         if self._rejects_outside:
             outside = Outside(scenario, self._load(outside=True),
                               self._averaging.states(MeasurementModel.covariance))
@@ -580,8 +578,7 @@ class _Found(NamedTuple):
             return self.estimate
         see = self.see()
         density = functools.cache(lambda: see().mixture.normalised())
-        return dataclasses.replace(
-            self.estimate, see=see, density=None if reason else density)
+        return dataclasses.replace(self.estimate, see=see, density=None if reason else density)
 
     def see(self) -> Callable[[], Sighting]:
         """Return the function that describes the signals alone."""
