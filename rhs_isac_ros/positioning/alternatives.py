@@ -100,8 +100,11 @@ class _Offsets(NamedTuple):
     steps: int = 2
     reach: float = 2.0
     curvature: float = 0.5
-    # Absolute log odds of an alternative up to which its evidence may count.
+    # Absolute log odds of an alternative up to which its evidence may count, before and after the
+    # first step, and a step after which the curvature hardly changes.
     near: float = 30.0
+    sure: float = 12.0
+    close: float = 0.7
 
 
 _OFFSETS = _Offsets()
@@ -441,6 +444,9 @@ def log_ratios_of(
             there = ratios(moved, near)
             better = there > best
             best, at = np.where(better, there, best), np.where(better[:, None], moved, at)
+            if (np.abs(step).max(axis=1) < _OFFSETS.close)[
+                    alternative.log_odds + best > -_OFFSETS.sure].all():
+                break
         found[near], values[near] = best - np.log(curvature).sum(axis=1) / 2, at
     return found, values, likelihood.whitened(values, signals)
 
