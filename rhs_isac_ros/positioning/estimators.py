@@ -406,8 +406,6 @@ class SearchEstimator(abc.ABC):
             parts.append(modes_from(
                 starts._replace(shots=starts.shots + shot), self._likelihood, signals, aligned,
                 float(margin.max())))
-        if len(parts) == 1:
-            return modes
         modes = concatenate(*parts)
         return select(modes, np.argsort(modes.shots, kind='stable'))
 
