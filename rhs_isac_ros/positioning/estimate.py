@@ -21,6 +21,7 @@ _MAX_MAGNITUDE = 1e3
 _MIN_STD_M = 1e-5
 # Probability that modes do not contain the position of a user in sight.
 MISS_PROBABILITY = 1e-3
+_OF_SITE = Pose()
 # Frames of an estimate.
 SURFACE, SITE = 'surface', 'site'
 
@@ -203,15 +204,20 @@ class Estimate:
         moving = [one for one in others if one.means.shape[1] > 3]
         if not moving or self.mixture is None:
             return self
-        return self.moving(with_velocities(self.mixture, moving, variance))
+        return self.described(with_velocities(self.mixture, moving, variance))
 
-    def moving(self, mixture: Mixture) -> 'Estimate':
-        """Return the estimate with the moments of a mixture with velocities."""
+    def described(self, mixture: Mixture, pose: Pose = _OF_SITE) -> 'Estimate':
+        """Return the estimate with a mixture and its moments, in the frame of a surface."""
         mean, covariance = mixture.moments()
+        found = dataclasses.replace(
+            self, mean=pose.to_surface(mean[:3]), density=mixture,
+            covariance=pose.covariances_to_surface(covariance[:3, :3]))
+        if len(mean) == 3:
+            return found
         return dataclasses.replace(
-            self, mean=mean[:3], covariance=covariance[:3, :3], velocity=mean[3:],
-            velocity_covariance=covariance[3:, 3:], cross_covariance=covariance[:3, 3:],
-            density=mixture)
+            found, velocity=pose.vectors_to_surface(mean[3:]),
+            velocity_covariance=pose.covariances_to_surface(covariance[3:, 3:]),
+            cross_covariance=pose.covariances_to_surface(covariance[:3, 3:]))
 
     def to_site(self, pose: Pose) -> 'Estimate':
         """Convert from the frame of a surface to that of the site, with the errors of its pose.

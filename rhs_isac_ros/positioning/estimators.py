@@ -13,7 +13,6 @@ import numpy as np
 from rhs_isac_ros.model import MeasurementModel, Pose
 from rhs_isac_ros.model.arrays import blocks, mixture_weights
 from rhs_isac_ros.model.gaussian import share_of_level
-from rhs_isac_ros.model.geometry import jacobian
 from rhs_isac_ros.positioning.alternatives import (
     Alternative,
     Blocked,
@@ -47,10 +46,13 @@ from rhs_isac_ros.positioning.posterior import (
     draw_samples,
 )
 from rhs_isac_ros.positioning.prior import (
+    ELSEWHERE,
     MIN_EXTENT_M,
     PRIOR_MARGIN,
     WRONG,
+    Users,
     cells_of,
+    constant_covariance,
     constant_shares,
     inside,
     is_doubtful,
@@ -231,9 +233,8 @@ class SearchEstimator(abc.ABC):
         Parameters
         ----------
         prior
-            Mixture in the frame of the site; by default, a uniform density on the region. If the
-            table of the region does not exist yet, only the cells where the prior is are searched
-            at first, and the region if the prior does not explain the signals.
+            Mixture in the frame of the site, also with velocities if users move; by default, a
+            uniform density on the region.
         wrong
             Probability that the prior does not hold, and the user is anywhere in the region.
         share
@@ -256,8 +257,7 @@ class SearchEstimator(abc.ABC):
             if not 0 < finite('share', share) <= 1:
                 raise ValueError(f'share: {share}, expected an exponent above 0, up to 1')
             finite('n_before', n_before, 0.0)
-            before = self.in_front(prior, wrong)
-            found = [self._update(select(signals, [n]), before, wrong, share, n_before)
+            found = [self._update(select(signals, [n]), prior, wrong, share, n_before)
                      for n in range(len(signals.received))]
         return found[0] if np.ndim(received) == 2 else Estimate.of_each(found)
 
@@ -271,9 +271,12 @@ class SearchEstimator(abc.ABC):
             pose.to_site(self._bounds.mean(axis=0)),
             pose.covariances_to_site(np.diag(np.maximum(extent, MIN_EXTENT_M)**2)), wrong), pose)
 
-    def _update(self, signals: Signals, before: Sheets, wrong: float, share: float,
+    def _update(self, signals: Signals, prior: Mixture, wrong: float, share: float,
                 n_before: float) -> Estimate:
-        """Compute the posterior of one shot for a prior, whose last component is everywhere."""
+        """Compute the posterior of one shot for a prior."""
+        if self.scenario.user_speed_std_mps:
+            return self._moving(signals, prior, wrong, share)
+        before = self.in_front(prior, wrong)
         constant = self.constant_shares if n_before else np.zeros(3)
         for scope in self._scopes(select(before, slice(-1)), wrong):
             (found,) = self._locate_block(scope, signals, draws=False)
@@ -297,12 +300,16 @@ class SearchEstimator(abc.ABC):
             density = concatenate(density, before.weighted(everywhere + odds))
         return self.restricted(density.reduce(), dataclasses.replace(
             estimate, see=found.see(), is_elsewhere=products.is_last),
-            self._constant(products.best, constant))
+            constant_covariance(products.best, constant, self.scenario.pose))
 
-    def _constant(self, sheet: Sheets, shares: np.ndarray) -> np.ndarray:
-        """Return the covariance of errors of elements in the site, float64 [3, 3] [m^2]."""
-        by_point = self.scenario.pose.rotation @ jacobian(sheet.means)[0] * np.sqrt(shares)
-        return by_point @ sheet.covariances[0] @ by_point.T
+    def _moving(self, signals: Signals, prior: Mixture, wrong: float, share: float) -> Estimate:
+        """Compute the posterior of one shot of a user who moves."""
+        estimate = self._locate_block(self._region, signals)[0].posterior()
+        if (seen := estimate.sighting) is None or not estimate.fix:
+            return estimate
+        density = Users.of(self.scenario, self._bounds, self.scenario.pose).updated(
+            prior, seen.mixture.normalised(), seen.missing, share, wrong)
+        return self.restricted(self.in_front(density, ELSEWHERE), estimate, np.zeros((3, 3)))
 
     def begin(self, estimate: Estimate) -> Mixture:
         """Return the posterior without a prior, from which a track begins."""
@@ -311,7 +318,7 @@ class SearchEstimator(abc.ABC):
         best = select(sheets, [int(np.argmax(sheets.log_peaks))])
         density = uniform(sheets.narrowed(self.constant_shares), self._bounds).normalised()
         return density.to_mixture(self.scenario.pose).shared(
-            self._constant(best, self.constant_shares))
+            constant_covariance(best, self.constant_shares, self.scenario.pose))
 
     @functools.cached_property
     def constant_shares(self) -> np.ndarray:
@@ -325,12 +332,9 @@ class SearchEstimator(abc.ABC):
         """
         density, mixture = inside(
             density, self._bounds, self.normal[:_LIMITS.narrow], self.scenario.pose)
-        mixture = mixture.shared(constant)
-        mean, covariance = mixture.position().moments()
         pose = self.scenario.pose
         return dataclasses.replace(
-            estimate, mean=pose.to_surface(mean),
-            covariance=pose.covariances_to_surface(covariance), density=mixture,
+            estimate.described(mixture.shared(constant), pose),
             unbounded=density.to_mixture(pose).shared(constant))
 
     @abc.abstractmethod
@@ -339,11 +343,10 @@ class SearchEstimator(abc.ABC):
 
     def _locate(self, batch: np.ndarray) -> Iterator[Estimate]:
         signals = self._likelihood.signals(batch)
-        parts = map_blocks(
+        return itertools.chain.from_iterable(map_blocks(
             lambda block: [one.estimate for one in self._locate_block(
                 self._region, select(signals, block))],
-            blocks(len(batch), _LIMITS.block))
-        return itertools.chain.from_iterable(parts)
+            blocks(len(batch), _LIMITS.block)))
 
     def _locate_block(self, scope: SearchScope, signals: Signals, draws: bool = True
                       ) -> list['_Found']:

@@ -138,6 +138,19 @@ class Mixture(_Arrays):
         return self._replace(
             means=self.means[:, :3], covariances=self.covariances[:, :3, :3])
 
+    def at_velocities(self: _MixtureT, variance: np.ndarray) -> _MixtureT:
+        """Return the mixture with D = 6; without velocities, they get a density around 0.
+
+        `variance`, [3, 3] [m^2/s^2], is the covariance of this density.
+        """
+        n, size = self.means.shape
+        if size > 3:
+            return self
+        covariances = np.zeros((n, 6, 6))
+        covariances[:, :3, :3], covariances[:, 3:, 3:] = self.covariances, variance
+        return self._replace(
+            means=np.hstack([self.means, np.zeros((n, 3))]), covariances=covariances)
+
     def scaled(self: _MixtureT, factor: float) -> _MixtureT:
         """Return the mixture with its covariance multiplied by a factor, around its mean."""
         mean = self.probabilities @ self.means

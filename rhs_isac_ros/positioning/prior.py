@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model import MeasurementModel
+from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.model.gaussian import likelihood_loss, moments, quadratic_form
 from rhs_isac_ros.model.geometry import jacobian, region_information, to_polar
@@ -30,7 +30,7 @@ from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.estimate import regular
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Grid, Resolution
 from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
-from rhs_isac_ros.positioning.mixture import Mixture, overlap
+from rhs_isac_ros.positioning.mixture import Mixture, overlap, velocity_variance
 from rhs_isac_ros.positioning.search import EXACT_MARGIN, Modes, expanded_at
 from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.positioning.sheets import Sheets, move_inside
@@ -38,6 +38,8 @@ from rhs_isac_ros.support import streams
 
 # Probability that a prior does not hold.
 WRONG = 0.1
+# Probability that a user is anywhere in the region although a posterior is far outside.
+ELSEWHERE = 1e-12
 # Smallest extent of the region of which modes are part without a prior [m].
 MIN_EXTENT_M = 1.0
 
@@ -58,6 +60,8 @@ class _Limits(NamedTuple):
     # largest one, do not contribute to moments.
     weight: float = -9.0
     density: float = 0.01
+    # Maximum number of components of a posterior of mixtures, each of which meets all of a phase.
+    components: int = 24
     # Share of true priors that are doubted.
     doubt: float = 0.02
     # Shares of variances that errors of elements cause: number of positions over which they are
@@ -87,6 +91,42 @@ def cells_of(bent: Sheets, grid: Grid, resolution: Resolution) -> np.ndarray:
     beside = (offsets <= reach[..., 1:] + PHASE_ERROR * resolution.direction).all(axis=2)
     chosen: np.ndarray = (in_range[:, grid.range_bin] & beside[:, grid.node]).any(axis=0)
     return chosen
+
+
+class Users(NamedTuple):
+    """What is known of users without signals, in the frame of the site."""
+
+    centre_m: np.ndarray  # Of the region, float64 [3].
+    squares_m2: np.ndarray  # Squared edges of the region as a covariance, float64 [3, 3].
+    log_volume: float
+    velocity: np.ndarray  # Covariance of velocities in a cycle, float64 [3, 3] [m^2/s^2].
+
+    @classmethod
+    def of(cls, scenario: Scenario, bounds_m: np.ndarray, pose: Pose) -> 'Users':
+        """Take the bounds of the region around a pose, float64 [2, 3] [m]."""
+        size_m = np.ptp(bounds_m, axis=0)
+        size_m = np.where(size_m > 0, size_m, MIN_EXTENT_M)
+        return cls(pose.to_site(bounds_m.mean(axis=0)),
+                   pose.covariances_to_site(np.diag(size_m**2)), float(np.log(size_m).sum()),
+                   pose.covariances_to_site(
+                       velocity_variance(scenario.user_speed_std_mps, bounds_m)))
+
+    def updated(self, prior: Mixture, likelihood: Mixture, missing: float, share: float,
+                wrong: float) -> Mixture:
+        """Multiply a prior by a likelihood of positions, or also of velocities.
+
+        A likelihood of velocities contains their declared density, which a prior of positions
+        takes over. `missing` is the probability that the likelihood does not contain the position,
+        `share` its exponent, and `wrong` the probability that the prior does not hold.
+        """
+        likelihood = likelihood.fresh
+        if likelihood.means.shape[1] > 3:
+            prior = prior.at_velocities(self.velocity)
+            likelihood = likelihood.without_prior(self.velocity)
+        prior = prior.or_within(self.centre_m, self.squares_m2, wrong)
+        seen = prior.product(likelihood.powered(share)).weighted(np.log1p(-missing))
+        unseen = prior.weighted(np.log(missing) - self.log_volume)
+        return concatenate(seen, unseen).normalised().reduce(_LIMITS.components)
 
 
 class Products(NamedTuple):
@@ -234,3 +274,13 @@ def constant_shares(model: MeasurementModel) -> np.ndarray:
     constant = variances @ pulls @ variances
     shares = np.diagonal(constant, axis1=1, axis2=2) / np.diagonal(variances, axis1=1, axis2=2)
     return np.minimum(shares[:, :3].mean(axis=0), _LIMITS.most)
+
+
+def constant_covariance(sheet: Sheets, shares: np.ndarray, pose: Pose) -> np.ndarray:
+    """Return the covariance of the errors of elements at a sheet, C = 1, in the site.
+
+    The result is float64 [3, 3] [m^2]; `shares` are those of `constant_shares`.
+    """
+    by_point = pose.rotation @ jacobian(sheet.means)[0] * np.sqrt(shares)
+    covariance: np.ndarray = by_point @ sheet.covariances[0] @ by_point.T
+    return covariance

@@ -17,8 +17,8 @@ from rhs_isac_ros.model.multipath import time_correlation
 from rhs_isac_ros.positioning.alternatives import BLOCKED_LIMIT, LIMIT
 from rhs_isac_ros.positioning.estimate import SITE, Estimate, SignalError
 from rhs_isac_ros.positioning.estimators import SearchEstimator
-from rhs_isac_ros.positioning.mixture import Mixture, velocity_variance
-from rhs_isac_ros.positioning.prior import MIN_EXTENT_M
+from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.prior import ELSEWHERE, Users
 from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.support.fields import finite, to_number
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -42,12 +42,8 @@ class Limits(NamedTuple):
     # exponent of the likelihood; with a small one, modes overlap, and the likelihood is no longer
     # their sum.
     least_share: float = 0.25
-    # Probability that the user is anywhere in the region although a prediction is far outside.
-    elsewhere: float = 1e-12
     # Distance over which errors of elements change, so that they favour other modes [m].
     shared_m: float = 1.0
-    # Maximum number of components of a track of mixtures, each of which meets all of a phase.
-    max_components: int = 24
 
 
 LIMITS = Limits()
@@ -81,14 +77,7 @@ class Motion:
 
     def start(self, mixture: Mixture) -> Mixture:
         """Add velocities of the stationary process to a mixture without velocities."""
-        n, size = mixture.means.shape
-        if size > 3:
-            return mixture
-        covariances = np.zeros((n, 6, 6))
-        covariances[:, :3, :3] = mixture.covariances
-        covariances[:, 3:, 3:] = self.velocity_variance * np.eye(3)
-        return Mixture._make((
-            mixture.log_weights, np.hstack([mixture.means, np.zeros((n, 3))]), covariances))
+        return mixture.at_velocities(self.velocity_variance * np.eye(3))
 
     def predict(self, mixture: Mixture, elapsed_s: float) -> Mixture:
         """Return the mixture after a time of at least 0 [s].
@@ -158,7 +147,7 @@ class MixtureTracker:
 
     def __init__(self, scenario: Scenario, bounds_m: np.ndarray, motion: Motion) -> None:
         self._scenario, self._motion = scenario, motion
-        self._users = _Users.of(scenario, bounds_m, Pose())
+        self._users = Users.of(scenario, bounds_m, Pose())
         self._mixture: Mixture | None = None
         self._time_s, self._n_phases = -np.inf, 0
 
@@ -184,48 +173,15 @@ class MixtureTracker:
         share = independent_share(self._scenario, elapsed_s)
         if share < LIMITS.least_share:
             return self._described(predicted, constant)
-        self._mixture = self._users.updated(predicted, likelihood, missing, share, elapsed_s)
+        self._mixture = self._users.updated(
+            predicted, likelihood, missing, share, LIMITS.loss_rate_hz * elapsed_s)
         self._time_s = time_s
         self._n_phases += 1
         return self._described(self._mixture, constant)
 
     def _described(self, mixture: Mixture, constant: np.ndarray) -> Estimate:
-        return Estimate.without_fix('', n_phases=self._n_phases, frame=SITE).moving(
+        return Estimate.without_fix('', n_phases=self._n_phases, frame=SITE).described(
             mixture.shared(constant))
-
-
-class _Users(NamedTuple):
-    """What is known of users without signals, in the frame of the site."""
-
-    centre_m: np.ndarray  # Of the region, float64 [3].
-    squares_m2: np.ndarray  # Squared edges of the region as a covariance, float64 [3, 3].
-    log_volume: float
-    velocity: np.ndarray  # Covariance of velocities in a cycle, float64 [3, 3] [m^2/s^2].
-
-    @classmethod
-    def of(cls, scenario: Scenario, bounds_m: np.ndarray, pose: Pose) -> '_Users':
-        """Take the bounds of the region around a pose, float64 [2, 3] [m]."""
-        size_m = np.ptp(bounds_m, axis=0)
-        size_m = np.where(size_m > 0, size_m, MIN_EXTENT_M)
-        return cls(pose.to_site(bounds_m.mean(axis=0)),
-                   pose.covariances_to_site(np.diag(size_m**2)), float(np.log(size_m).sum()),
-                   pose.covariances_to_site(
-                       velocity_variance(scenario.user_speed_std_mps, bounds_m)))
-
-    def updated(self, predicted: Mixture, likelihood: Mixture, missing: float, share: float,
-                elapsed_s: float) -> Mixture:
-        """Multiply a prediction by a likelihood of positions, or also of velocities.
-
-        The arguments are those of `MixtureTracker.update`.
-        """
-        likelihood = likelihood.fresh
-        if likelihood.means.shape[1] > 3:
-            likelihood = likelihood.without_prior(self.velocity)
-        predicted = predicted.or_within(
-            self.centre_m, self.squares_m2, LIMITS.loss_rate_hz * elapsed_s)
-        seen = predicted.product(likelihood.powered(share)).weighted(np.log1p(-missing))
-        unseen = predicted.weighted(np.log(missing) - self.log_volume)
-        return concatenate(seen, unseen).normalised().reduce(LIMITS.max_components)
 
 
 class Tracker:
@@ -242,8 +198,6 @@ class Tracker:
 
     def __init__(self, estimator: SearchEstimator, motion: Motion | None = None) -> None:
         self.estimator, self._motion = estimator, motion or Motion()
-        scenario = estimator.scenario
-        self._users = _Users.of(scenario, scenario.roi_bounds_m, scenario.pose)
         #: Posterior after the latest phase; None before the first one. Its sighting is that of the
         #: signals of this phase alone.
         self.latest: Estimate | None = None
@@ -290,24 +244,15 @@ class Tracker:
         self._mixture, self._time_s = found.unbounded.fresh, time_s
         self._constant = found.unbounded.constant_covariance
         self._n_phases += 1
-        return self._described(found, self._mixture)
+        return dataclasses.replace(found, n_phases=self._n_phases)
 
     def _posterior(self, received: np.ndarray, predicted: Mixture, elapsed_s: float,
                    n_before: float) -> Estimate:
         """Return the posterior for a prediction; see `SearchEstimator.posterior`."""
-        estimator, share = self.estimator, independent_share(self.estimator.scenario, elapsed_s)
-        if not estimator.scenario.user_speed_std_mps:
-            return estimator.posterior(
-                received, predicted, share=share, wrong=LIMITS.loss_rate_hz * elapsed_s,
-                n_before=n_before)
-        # The posterior of users who move has velocities, which the prediction has, too.
-        found = estimator.posterior(received)
-        if found.sighting is None or not found.fix:
-            return found
-        mixture = self._users.updated(predicted, found.sighting.mixture.normalised(),
-                                      found.sighting.missing, share, elapsed_s)
-        return estimator.restricted(
-            estimator.in_front(mixture, LIMITS.elsewhere), found, self._constant)
+        share = independent_share(self.estimator.scenario, elapsed_s)
+        return self.estimator.posterior(
+            received, predicted, share=share, wrong=LIMITS.loss_rate_hz * elapsed_s,
+            n_before=n_before)
 
     def predict(self, time_s: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Predict the position at a time [s] after the latest phase, in the surface's frame.
@@ -338,7 +283,9 @@ class Tracker:
         if time_s > self._latest_s:
             self._mixture, self._time_s, self._latest_s = mixture, time_s, time_s
             self._n_phases, self._constant = 1, begin.constant_covariance
-        return self._described(found, mixture, 1)
+        moving = found.described(mixture, self.estimator.scenario.pose)
+        return dataclasses.replace(moving, mean=found.mean, covariance=found.covariance,
+                                   density=found.density, n_phases=1)
 
     def _predicted(self, time_s: float, found: Estimate) -> Estimate:
         """Continue the track of a blocked user by prediction; other users get no position."""
@@ -356,18 +303,8 @@ class Tracker:
     def _placed(self, found: Estimate, mixture: Mixture) -> Estimate:
         """Replace the position of an estimate by that of a mixture inside the region."""
         placed = self.estimator.restricted(
-            self.estimator.in_front(mixture, LIMITS.elsewhere), found, self._constant)
-        assert isinstance(placed.unbounded, Mixture)
-        return self._described(placed, placed.unbounded)
-
-    def _described(self, estimate: Estimate, mixture: Mixture, n_phases: int = 0
-                   ) -> Estimate:
-        """Add the velocity of a mixture, in the frame of the surface, to an estimate."""
-        pose, (mean, covariance) = self.estimator.scenario.pose, mixture.moments()
-        return dataclasses.replace(
-            estimate, velocity=pose.vectors_to_surface(mean[3:]),
-            velocity_covariance=pose.covariances_to_surface(covariance[3:, 3:]),
-            n_phases=n_phases or self._n_phases)
+            self.estimator.in_front(mixture, ELSEWHERE), found, self._constant)
+        return dataclasses.replace(placed, n_phases=self._n_phases)
 
 
 def independent_share(scenario: Scenario, elapsed_s: float) -> float:

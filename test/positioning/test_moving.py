@@ -11,6 +11,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import to_polar, to_positions
 from rhs_isac_ros.positioning import BayesEstimator, MlEstimator
 from rhs_isac_ros.positioning.likelihood import Likelihood
+from rhs_isac_ros.positioning.mixture import Mixture
 from rhs_isac_ros.system import System
 
 CONFIG = Path(__file__).parents[2] / 'config'
@@ -74,6 +75,27 @@ def test_positions_and_velocities_are_in_their_regions(walking):
     assert inside(errors[:, :2], joint[:, :2, :2], 2) >= 0.85
     assert inside(errors, joint, 4) >= 0.85
     assert np.sqrt(np.mean(errors[:, 2:]**2)) < 0.3
+
+
+@pytest.mark.parametrize('size', [3, 6], ids=['positions', 'velocities'])
+def test_a_prior_changes_positions_and_velocities_together(walking, size):
+    """The covariance was negative where a prior changed that of positions alone."""
+    system, estimator = walking
+    rng = np.random.default_rng(5)
+    states = users_of(system.scenario, 4, 1.0, rng)
+    std = np.array([0.3, 0.3, 1e-4, 0.3, 0.3, 1e-4])[:size]
+    variances = np.empty((2, len(states)))
+    for n, (state, signals) in enumerate(zip(states, system.sample(states, rng), strict=True)):
+        mean = state[:size] + std * rng.standard_normal(size)
+        prior = Mixture(np.zeros(1), mean[None], np.diag(std**2)[None])
+        for row, given in enumerate([{'prior': prior}, {}]):
+            found = estimator.posterior(signals, **given)
+            mean, covariance = found.mixture.moments()
+            np.testing.assert_allclose(np.r_[found.mean, found.velocity], mean, atol=1e-12)
+            np.testing.assert_allclose(found.joint_covariance, covariance, atol=1e-12)
+            assert np.linalg.eigvalsh(covariance).min() >= 0
+            variances[row, n] = np.trace(covariance[:size, :size])
+    assert variances[0].mean() < variances[1].mean()
 
 
 @pytest.mark.parametrize('std_rad', [0.0, 2 * np.pi], ids=['known', 'unknown'])
