@@ -1,7 +1,8 @@
 """Movement of the users."""
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -97,50 +98,16 @@ class Static(StraightMobility):
         return Leg(self._position, np.zeros(3), finite('now_s', now_s), math.inf)
 
 
-class Waypoints:
-    """A user that follows a closed polygon of waypoints, float64 [N, 3] [m], at constant speed.
+class Walk(StraightMobility):
+    """A user that walks straight from each position of a sequence, float64 [3] [m], to the next.
 
-    The first call of `state` returns the first waypoint.
+    The speed is constant. Where a position follows itself, the user stands for `_STAND_S`. Legs
+    that would have ended more than `_MAX_GAP_S` before a call are skipped.
     """
 
-    def __init__(self, waypoints: ArrayLike, speed_mps: float) -> None:
-        self._points = checked_positions(waypoints)
+    def __init__(self, positions: Iterator[np.ndarray], speed_mps: float) -> None:
         self._speed_mps = finite('speed_mps', speed_mps, 0.0)
-        legs = np.roll(self._points, -1, axis=0) - self._points
-        self._lengths = np.linalg.norm(legs, axis=1)
-        self._directions = legs / np.maximum(self._lengths, 1e-12)[:, None]
-        self._start_s: float | None = None
-
-    def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the position [3] [m] and velocity [3] [m/s] on the polygon."""
-        now_s = finite('now_s', now_s)
-        if self._start_s is None:
-            self._start_s = now_s
-        perimeter = self._lengths.sum()
-        if perimeter == 0 or self._speed_mps == 0:
-            return self._points[0].copy(), np.zeros(3)
-        distance = (now_s - self._start_s) * self._speed_mps % perimeter
-        ends = np.cumsum(self._lengths)
-        leg = min(int(np.searchsorted(ends, distance, side='right')), len(ends) - 1)
-        along_leg = distance - (ends[leg] - self._lengths[leg])
-        return (self._points[leg] + along_leg * self._directions[leg],
-                self._speed_mps * self._directions[leg])
-
-
-class RandomWalk(StraightMobility):
-    """A user that walks straight between random positions from `Scenario.sample_positions`.
-
-    The first position is also random, unless it is given as `start`, float64 [3] [m]. If the same
-    position is drawn twice, the user stands there for `_STAND_S`. Legs that would have ended more
-    than `_MAX_GAP_S` before a call are skipped.
-    """
-
-    def __init__(
-            self, scenario: Scenario, speed_mps: float, rng: np.random.Generator,
-            start: ArrayLike | None = None) -> None:
-        self._scenario, self._rng = scenario, rng
-        self._speed_mps = finite('speed_mps', speed_mps, 0.0)
-        self._target = self._draw() if start is None else checked_position(start, 'start')
+        self._positions, self._target = positions, next(positions)
         self._leg: Leg | None = None
 
     def leg(self, now_s: float) -> Leg:
@@ -152,18 +119,36 @@ class RandomWalk(StraightMobility):
             self._leg = self._next(max(self._leg.end_s, now_s - _MAX_GAP_S))
         return self._leg
 
-    def _draw(self) -> np.ndarray:
-        return self._scenario.sample_positions(1, self._rng)[0]
-
     def _next(self, departure_s: float) -> Leg:
-        """Return the leg from the last target to a new one."""
-        origin, self._target = self._target, self._draw()
+        """Return the leg from the last target to the next one."""
+        origin, self._target = self._target, next(self._positions)
         way = self._target - origin
         length = float(np.linalg.norm(way))
         if length == 0:
             return Leg(origin, way, departure_s, departure_s + _STAND_S)
         duration_s = length / self._speed_mps if self._speed_mps else math.inf
         return Leg(origin, way / length * self._speed_mps, departure_s, departure_s + duration_s)
+
+
+class Waypoints(Walk):
+    """A user that follows a closed polygon of waypoints, float64 [N, 3] [m]."""
+
+    def __init__(self, waypoints: ArrayLike, speed_mps: float) -> None:
+        super().__init__(itertools.cycle(checked_positions(waypoints)), speed_mps)
+
+
+class RandomWalk(Walk):
+    """A user that walks between random positions from `Scenario.sample_positions`.
+
+    The first position is also random, unless it is given as `start`, float64 [3] [m].
+    """
+
+    def __init__(
+            self, scenario: Scenario, speed_mps: float, rng: np.random.Generator,
+            start: ArrayLike | None = None) -> None:
+        first = [] if start is None else [checked_position(start, 'start')]
+        drawn = (scenario.sample_positions(1, rng)[0] for _ in itertools.count())
+        super().__init__(itertools.chain(first, drawn), speed_mps)
 
 
 class Traced:
