@@ -6,6 +6,7 @@ file of a system names a scenario, a codebook and, optionally, a calibration, as
 the file of a site.
 """
 
+import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.measurement import KnownSurface
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.arguments import input_file
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import whole
 from rhs_isac_ros.support.files import mapping_of, read_yaml
@@ -28,6 +30,12 @@ from rhs_isac_ros.support.threads import map_blocks
 # Number of pairs that share a random generator and all matrix products. Another number would
 # change the pairs of every seed.
 _CHUNK = 512
+# Options of commands for files that describe a system.
+_FILES = {
+    'config': "scenario file; by default that of a recording, or else the paper's Table I",
+    'codebook': 'codebook to assume; by default that of a recording',
+    'calibration': 'calibration of the surface; by default the surface of the scenario',
+    'system': 'system file, which names these files, except for those that are also given'}
 
 
 class System(MeasurementModel):
@@ -156,3 +164,18 @@ class SystemFiles(NamedTuple):
         surface = load_surface(str(self.calibration or ''), scenario)
         scenario = adapted(scenario)
         return System(scenario, Codebook.load(self.codebook, scenario), surface)
+
+
+def add_files(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Add options for files that describe a system; the names are keys of `_FILES`."""
+    for name in names:
+        parser.add_argument(f'--{name}', type=input_file, metavar='FILE', help=_FILES[name])
+
+
+def fill_in(options: argparse.Namespace) -> None:
+    """Fill in the files that are named by a system file and are not given as options."""
+    if getattr(options, 'system', None):
+        for name, path in SystemFiles.named_in(options.system)._asdict().items():
+            option = 'config' if name == 'scenario' else name
+            if getattr(options, option, path) is None:
+                setattr(options, option, path)

@@ -351,6 +351,12 @@ def file_sizes(n_bytes):
 
 
 @pytest.fixture
+def two_folds(monkeypatch):
+    """Two instead of five groups of pilots are left out: each is a survey, which takes long."""
+    monkeypatch.setattr('rhs_isac_ros.experiments.pilots._N_FOLDS', 2)
+
+
+@pytest.fixture
 def full_disk():
     """Context manager in which files can have only a number of bytes."""
     return file_sizes

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rhs_isac_ros.codebook import OBJECTIVES, CodebookError
+from rhs_isac_ros.experiments import calibrate
 from rhs_isac_ros.experiments.sweep import (
     BOUND,
     CRLB,
@@ -78,7 +79,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__, epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter)
     _add_options(sweep)
-    return _sweep(sweep, parser.parse_args(arguments))
+    sweep.set_defaults(run=lambda options: _sweep(sweep, options))
+    pilots = experiments.add_parser(
+        'calibrate', help='a surface, a hall or a board, from pilots at known positions',
+        description=calibrate.DESCRIPTION)
+    calibrate.add_options(pilots)
+    pilots.set_defaults(run=lambda options: calibrate.main(pilots, options))
+    options = parser.parse_args(arguments)
+    return int(options.run(options))
 
 
 def _sweep(parser: ArgumentParser, options: argparse.Namespace) -> int:

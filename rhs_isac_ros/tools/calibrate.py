@@ -11,29 +11,16 @@ import itertools
 import posixpath
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import yaml
 from rclpy.node import Node
 
-from rhs_isac_ros.calibration import (
-    Calibration,
-    CalibrationError,
-    Pilots,
-    known_states,
-    load_surface,
-    report,
-    survey_report,
-)
-from rhs_isac_ros.calibration.estimate import places_of
-from rhs_isac_ros.calibration.survey import PLACE_WAVELENGTHS
-from rhs_isac_ros.codebook import Codebook, default_codebook_file
-from rhs_isac_ros.experiments.pilots import Found, PilotWork
-from rhs_isac_ros.model import MultipathEstimate, Scenario
-from rhs_isac_ros.model.board import Board
-from rhs_isac_ros.model.boards import board_of
+from rhs_isac_ros.calibration import CalibrationError, Pilots
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.experiments import calibrate
+from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import stands_still
 from rhs_isac_ros.monitoring.cycle_log import SignalLog
 from rhs_isac_ros.positioning import Sighting, Site
@@ -47,26 +34,19 @@ from rhs_isac_ros.ros.recording import RecordingError, read_networks
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     input_file,
-    output_file,
     positive_float,
     positive_int,
 )
 from rhs_isac_ros.support.errors import translated
-from rhs_isac_ros.support.files import (
-    ArchiveError,
-    parse_yaml,
-    read_arrays,
-    save_or_rescue,
-    write_whole,
-)
-from rhs_isac_ros.support.job_commands import add_run_options, unfinished
-from rhs_isac_ros.support.jobs import JobError, Workers
+from rhs_isac_ros.support.files import save_or_rescue, write_whole
 from rhs_isac_ros.tools import command
 
 # The messages that pilots consist of.
 _RECEIVES = (m.GroundTruth, m.ReceivedSignals)
 _CYCLES = 200
-_OUTPUT, _SITE_OUTPUT = Path('calibration.npz'), Path('site_calibrated.yaml')
+_SITE_OUTPUT = Path('site_calibrated.yaml')
+_NOT_OF_SITES = ('file', 'multipath', 'states', 'board', 'system', 'config', 'codebook',
+                 'calibration', 'jobs', 'dask')
 _TIMEOUT_S = 600.0
 
 
@@ -200,74 +180,13 @@ def _align(options: argparse.Namespace, arguments: list[str]) -> int:
 def _calibrate(options: argparse.Namespace, arguments: list[str]) -> int:
     if options.site:
         return _align(options, arguments)
-    has_arrays = options.file and options.file.suffix == '.npz'
-    try:
-        scenario = command.choose_scenario(
-            options.config, None if has_arrays else options.file, options.namespace)
-        if options.states:
-            if options.file:
-                raise CalibrationError(f'{options.file}: expected no file with --states')
-            return _save(known_states(scenario, *options.states), options.output)
-        pilots = ([_arrays(options, scenario)] if has_arrays
-                  else _collected(options, scenario, arguments))
-        with unfinished(options.output, options) as workers:
-            if options.board is not None:
-                _compare(scenario, pilots, workers, options)
-            elif options.multipath:
-                _survey(scenario, pilots, workers, options)
-            else:
-                found = PilotWork(workers, scenario, pilots).estimate(multipath=False)
-                save_or_rescue(lambda path: write_whole(path, found.archive), options.output)
-                calibration = Calibration.load(options.output)
-                print(report(calibration, scenario), flush=True)
-                _print_errors(found)
-                print(f'{options.output}: calibration {calibration.id}')
-        return 0
-    except JobError as error:
-        raise command.ToolError(f'{error}; repeat the command to resume') from None
-    except ValueError as error:
-        raise CalibrationError(str(error)) from None
-
-
-def _compare(scenario: Scenario, pilots: Sequence[Pilots], workers: Workers,
-             options: argparse.Namespace) -> None:
-    """Print the evidence of boards, and fit parameters of the best one."""
-    work = PilotWork(workers, scenario, pilots)
-    boards = [*dict.fromkeys([scenario.board, *options.board])]
-    found = dict(zip(boards, work.evidence([board.plain for board in boards]), strict=True))
-    best = max(found, key=lambda board: found[board])
-    for board, value in sorted(found.items(), key=lambda item: -item[1]):
-        print(f'{_board_text(board.plain)}: log evidence {value - found[best]:.1f}', flush=True)
-    if options.fit:
-        fit = work.fit(best.plain, options.fit)
-        std = np.sqrt(np.diagonal(fit['covariance']))
-        for name, value, deviation, row in zip(
-                fit['names'], fit['values'], std, fit['covariance'], strict=True):
-            print(f'{name}: {value:.8g} +- {deviation:.3g}; row of the covariance: '
-                  f'{", ".join(f"{entry:.3g}" for entry in row)}')
-        gain = fit['log_evidence'] - found[best]
-        print(f'log evidence {gain:.1f} with the line "board: {_board_text(fit["board"])}" in the '
-              'scenario file')
-
-
-def _board_text(plain: object) -> str:
-    return yaml.safe_dump(plain, default_flow_style=True, width=10**6).split('\n')[0]
-
-
-def _save(calibration: Calibration, output: Path) -> int:
-    save_or_rescue(calibration.save, output)
-    print(f'{output}: calibration {calibration.id}')
+    needs_none = options.states or options.file and options.file.suffix == calibrate.ARRAYS
+    scenario = command.choose_scenario(
+        options.config, None if needs_none else options.file, options.namespace)
+    with translated(ValueError, CalibrationError):
+        pilots = None if needs_none else _collected(options, scenario, arguments)
+    calibrate.estimate(options, scenario, pilots)
     return 0
-
-
-def _arrays(options: argparse.Namespace, scenario: Scenario) -> Pilots:
-    """Return the pilots in a file with the arrays ``positions`` and ``received``."""
-    arrays = read_arrays(options.file)
-    for name in ('positions', 'received'):
-        if name not in arrays:
-            raise ArchiveError(f'{options.file}: {name}: missing, expected an array of this name')
-    codebook = Codebook.load(options.codebook or default_codebook_file(), scenario)
-    return Pilots(codebook, arrays['positions'], arrays['received'])
 
 
 def _collected(
@@ -302,67 +221,13 @@ def _collected(
     return pilots
 
 
-def _survey(scenario: Scenario, pilots: Sequence[Pilots], workers: Workers,
-            options: argparse.Namespace) -> None:
-    """Estimate the multipath from pilots with the codebook that was used at the most places."""
-    group = max(pilots, key=lambda group: len(
-        places_of(scenario, group.positions, PLACE_WAVELENGTHS)))
-    n_other = sum(len(one.positions) for one in pilots) - len(group.positions)
-    if n_other:
-        print(f'{n_other} pilots with other codebooks have no effect')
-    load_surface(str(options.calibration or ''), scenario)
-    found = PilotWork(workers, scenario, [group]).estimate(True, options.calibration)
-    save_or_rescue(lambda path: write_whole(path, found.archive), options.output)
-    estimate = MultipathEstimate.load(str(options.output))
-    print(survey_report(estimate), flush=True)
-    _print_errors(found)
-    print(f'{options.output}: multipath {estimate.digest}; use it with the line '
-          f'"multipath: {options.output.name}" in a scenario file beside it')
-
-
-def _print_errors(found: Found) -> None:
-    """Print position errors at places that were left out, before and after a calibration."""
-    for text, every in (('before', found.before_m), ('after', found.after_m)):
-        fixes = every[np.isfinite(every)]
-        rms = f'{np.sqrt(np.mean(fixes**2)):.3f} m rms' if len(fixes) else 'none'
-        print(f'position error of left-out pilots {text}: {rms}, {len(every) - len(fixes)} of '
-              f'{len(every)} without a fix', flush=True)
-    if found.is_worse:
-        print('warning: significantly more left-out pilots are located worse after it than better',
-              flush=True)
-
-
-def _board(text: str) -> Board:
-    with translated(ValueError, argparse.ArgumentTypeError):
-        return board_of(parse_yaml(text))
-
-
-def _states(text: str) -> tuple[complex, ...]:
-    try:
-        states = tuple(complex(word) for word in text.split(','))
-    except ValueError:
-        states = ()
-    if len(states) != 2 or not np.isfinite(states).all():
-        raise argparse.ArgumentTypeError(f'{text!r}, expected two numbers such as 1,-1')
-    return states
-
-
 def _conflict(options: argparse.Namespace) -> str:
-    if (options.site or options.states) and (options.jobs != -1 or options.dask):
-        return 'arguments --jobs and --dask: not allowed with --site or --states'
-    options.output = options.output or (_SITE_OUTPUT if options.site else _OUTPUT)
-    others = [name for name in (
-        'file', 'multipath', 'states', 'board', 'system', 'config', 'codebook', 'calibration',
-        'namespace')
-        if getattr(options, name) not in (None, False, '/')]
-    if options.site and others:
-        return f'argument --site: not allowed with {", ".join(others)}'
-    if options.calibration and not options.multipath:
-        return 'argument --calibration: expected together with --multipath'
-    if options.fit and options.board is None:
-        return 'argument --fit: expected together with --board'
-    if options.states and options.codebook:
-        return 'argument --codebook: not allowed with --states'
+    if options.site and (others := calibrate.given(options, _NOT_OF_SITES)):
+        return f'argument --site: not allowed with {others}'
+    if options.site and not options.output:
+        options.output = _SITE_OUTPUT
+    if problem := calibrate.conflict(options):
+        return problem
     if options.namespace != '/' and not options.file:
         return command.NO_NAMESPACE
     if (options.file or options.states) and (options.cycles, options.timeout) != (
@@ -373,38 +238,20 @@ def _conflict(options: argparse.Namespace) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
-        prog='calibrate', description='Estimate errors and failures of the elements, and gains '
-        'and phases of the bands, or the covariance of the multipath, from signals of users at '
-        'known positions. Without a file, the signals come from a running network.')
+        prog='calibrate', description=f'{calibrate.DESCRIPTION} Without a file, the signals come '
+        'from a running network.')
     add = parser.add_argument
-    add('file', type=input_file, nargs='?',
-        help='recording made with record, or .npz file with the arrays positions [N, 3] (m) and '
-        'received [N, N_B, N_SB F], by default received with the default codebook')
-    what = parser.add_mutually_exclusive_group()
-    what.add_argument('--multipath', action='store_true',
-        help='estimate the multipath of the hall instead of the surface, which --calibration '
-        'describes')
-    what.add_argument('--states', type=_states, metavar='OFF,ON',
-        help='write a surface whose elements have these coefficients for 0 and 1, such as 1,-1 or '
-        '0.5+0.1j,-0.6, without an estimation')
-    what.add_argument('--board', type=_board, nargs='*', metavar='BOARD',
-        help='compare the board of the scenario with others by their evidence, such as paper or '
-        '"{kind: resonant, quality_factor: 30}", instead of calibrating its elements')
-    add('--fit', nargs='+', metavar='FIELD',
-        help='fields of the most probable board to estimate, such as quality_factor')
+    calibrate.add_options(parser, 'recording, or ')
     add('--site', type=input_file, metavar='FILE',
         help='estimate the poses of the surfaces of a running site, except for the first one, '
-        'from users that two surfaces locate; write a site file')
-    add('--output', type=output_file, metavar='FILE',
-        help=f'file to write (default: {_OUTPUT}, or {_SITE_OUTPUT} with --site)')
-    command.add_files(parser, 'config', 'codebook', 'calibration', 'system')
+        'from users that two surfaces locate; write a site file, by default '
+        f'{_SITE_OUTPUT}')
     add('--namespace', default='/', help='namespace of the recorded network (default: /)')
     add('--cycles', type=positive_int, default=_CYCLES, metavar='N',
         help='pilots, or users that two surfaces locate, to collect from a running network '
         f'(default: {_CYCLES})')
     add('--timeout', type=positive_float, default=_TIMEOUT_S, metavar='S',
         help=f'maximum time to collect the pilots (default: {_TIMEOUT_S:g} s)')
-    add_run_options(parser)
     return parser
 
 

@@ -25,11 +25,12 @@ from rhs_isac_ros.ros.environment import check_environment
 from rhs_isac_ros.ros.recording import RecordingError, read, read_networks
 from rhs_isac_ros.ros.run import StartError, parse, spin
 from rhs_isac_ros.support import plugins
-from rhs_isac_ros.support.arguments import check_distinct, input_file
+from rhs_isac_ros.support.arguments import check_distinct
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.exits import finished
+from rhs_isac_ros.support.jobs import JobError
 from rhs_isac_ros.support.optional import MissingLibraryError
-from rhs_isac_ros.system import SystemFileError, SystemFiles
+from rhs_isac_ros.system import SystemFileError, fill_in
 
 # Errors in arguments and files.
 INVALID = (StartError, RecordingError, ScenarioError, SiteError, SystemFileError, CodebookError,
@@ -40,11 +41,6 @@ NO_NAMESPACE = ('argument --namespace: expected together with a recording; for a
 # Advice after an error about messages that do not match the scenario.
 OTHER_SCENARIO = '; if the network uses another scenario, pass it with --config FILE'
 _NodeT = TypeVar('_NodeT', bound=Node)
-_FILES = {
-    'config': "scenario file; by default the recorded scenario, or the paper's Table I",
-    'codebook': 'codebook to assume; by default the recorded one',
-    'calibration': 'calibration of the surface; by default the surface of the scenario',
-    'system': 'system file, which names these files, except for those that are also given'}
 
 
 class ToolError(RuntimeError):
@@ -87,23 +83,8 @@ def entry(
             check_distinct(parser, options)
             return work(options, [parser.prog, *arguments])
         return finished(checked, INVALID, parser.prog, interrupted=0,
-                        failures=(ToolError, MissingLibraryError, OSError))
+                        failures=(ToolError, JobError, MissingLibraryError, OSError))
     return main
-
-
-def add_files(parser: argparse.ArgumentParser, *names: str) -> None:
-    """Add options for files that describe a network; the names are keys of `_FILES`."""
-    for name in names:
-        parser.add_argument(f'--{name}', type=input_file, metavar='FILE', help=_FILES[name])
-
-
-def fill_in(options: argparse.Namespace) -> None:
-    """Fill in the files that are named by a system file and are not given as options."""
-    if getattr(options, 'system', None):
-        for name, path in SystemFiles.named_in(options.system)._asdict().items():
-            option = 'config' if name == 'scenario' else name
-            if getattr(options, option, path) is None:
-                setattr(options, option, path)
 
 
 #: Prints and flushes, so that the reader of a pipe receives the text at once.

@@ -55,7 +55,8 @@ from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.exits import on_end_signals, print_error
 from rhs_isac_ros.support.pictures import write_picture
 from rhs_isac_ros.support.texts import counted, text_table
-from rhs_isac_ros.tools.command import add_files, choose_scenario, entry
+from rhs_isac_ros.system import add_files
+from rhs_isac_ros.tools.command import choose_scenario, entry
 from rhs_isac_ros.tools.pictures import compose_cycles
 
 # Maximum time between two complete cycles [s].

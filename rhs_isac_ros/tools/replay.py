@@ -34,7 +34,7 @@ from rhs_isac_ros.ros.recording import Recorded, RecordingError, read_networks
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.texts import text_table
-from rhs_isac_ros.system import System
+from rhs_isac_ros.system import System, add_files
 from rhs_isac_ros.tools import command, republish
 from rhs_isac_ros.tools.command import ToolError
 
@@ -302,7 +302,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--track', action='store_true', help='also track the users with the estimator bayes')
     add('--track-speed', type=positive_float, metavar='MPS',
         help=f'typical speed of the users (default: {Motion.speed_mps:g} m/s)')
-    command.add_files(parser, 'codebook', 'config', 'calibration', 'system')
+    add_files(parser, 'codebook', 'config', 'calibration', 'system')
     add('--library', type=input_file, metavar='FILE',
         help='library of codebooks that the network has used')
     add('--model', type=input_file, metavar='FILE', help='model of the estimator neural')

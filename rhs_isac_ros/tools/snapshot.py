@@ -16,6 +16,7 @@ from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float, picture_file
 from rhs_isac_ros.support.pictures import write_picture
 from rhs_isac_ros.support.texts import listed
+from rhs_isac_ros.system import add_files
 from rhs_isac_ros.tools import command
 from rhs_isac_ros.tools.command import ToolError
 from rhs_isac_ros.tools.pictures import compose_scene
@@ -119,7 +120,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--timeout', type=nonnegative_float, default=30.0, metavar='S',
         help='maximum wait in total; the known part of the scene is then drawn '
         '(default: 30 s)')
-    command.add_files(parser, 'config')
+    add_files(parser, 'config')
     return parser
 
 

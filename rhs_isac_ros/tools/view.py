@@ -32,6 +32,7 @@ from rhs_isac_ros.support.arguments import (
     positive_int,
 )
 from rhs_isac_ros.support.exits import on_end_signals
+from rhs_isac_ros.system import add_files
 from rhs_isac_ros.tools import command
 from rhs_isac_ros.tools.command import ToolError
 from rhs_isac_ros.tools.rerun_stream import RerunStream
@@ -220,7 +221,7 @@ def _parser() -> argparse.ArgumentParser:
         help='write a file for Rerun, *.rrd, instead of serving the viewer')
     add('--cycles', type=positive_int, default=0, metavar='N',
         help='show N cycles; the view of a running network then ends')
-    command.add_files(parser, 'config')
+    add_files(parser, 'config')
     add = parser.add_argument_group('browser').add_argument
     add('--port', type=integer(1, 65533), default=_PORT, metavar='P',
         help=f'port of the viewer; its data use the next two (default: {_PORT})')

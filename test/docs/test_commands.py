@@ -21,9 +21,9 @@ LEFT_OUT = {
         'installs; test_examples installs the plug-ins',
     r'scripts/(demo|run|topic|param|record|watch|view|board)\b|export ROS|\. ':
         'needs a network, a board or a browser; the tests of nodes and tools run these programs',
-    'scripts/replay|rosbags-convert|scripts/calibrate .*(mcap|arrays)|python3 -m .*touchstone':
+    'scripts/replay|rosbags-convert|.* ?calibrate .*(mcap|arrays)|python3 -m .*touchstone':
         'needs a recording or a file of a solver; the tests of tools make their own',
-    'scripts/(test|benchmark|reproduce)|python3 -m .*(experiments|positioning|library|spectrum)':
+    'scripts/(test|benchmark|reproduce)|python3 -m .*(sweep|positioning|library|spectrum)':
         'takes minutes; their tests run them with fewer trials',
     r'python3 -m rhs_isac_ros.codebook (?!.*--method random)': 'optimises for a minute',
     'dask|[^ ]* docs/examples/': 'does not end, or is run by test_examples or test_tasks',

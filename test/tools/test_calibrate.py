@@ -75,12 +75,6 @@ def recording(record, surface):
     return record(N_PILOTS, surface, NAMESPACE)
 
 
-@pytest.fixture
-def two_folds(monkeypatch):
-    """Two instead of five groups of places are left out: each is a survey, which takes long."""
-    monkeypatch.setattr(pilots, '_N_FOLDS', 2)
-
-
 @pytest.fixture(scope='module')
 def surface():
     declared = Impairments(**{name: value for name, value in ERRORS.items() if name != 'seed'})
@@ -91,9 +85,7 @@ def surface():
 def call(*arguments):
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        # Only known states take no jobs.
-        jobs = [] if any('--states' in str(one) for one in arguments) else ['--jobs', '1']
-        code = calibrate.main([*jobs, *map(str, arguments)])
+        code = calibrate.main(['--jobs', '1', *map(str, arguments)])
     # On a slow machine, the progress of the jobs appears.
     err = re.sub(r'job \d+ of \d+: .*\n', '', err.getvalue())
     return types.SimpleNamespace(code=code, out=out.getvalue(), err=err)
@@ -131,77 +123,6 @@ def test_a_recording_is_a_survey_of_the_multipath(recording, calibrated, two_fol
     assert done.out.splitlines()[-1].startswith(f'{hall}: multipath {estimate.digest}; ')
 
 
-def test_arrays_are_a_survey_of_the_multipath(two_folds, tmp_path):
-    rng = np.random.default_rng(0)
-    positions = SCENARIO.sample_positions(12, rng)
-    received = simulate_received(SCENARIO, CODEBOOK, positions, rng)
-    np.savez(tmp_path / 'arrays.npz', positions=positions, received=received)
-    options = ('--multipath', '--config', CONFIG / 'quick.yaml', '--codebook',
-               CONFIG / 'codebook_quick.yaml', '--output', tmp_path / 'hall.npz')
-    done = call(tmp_path / 'arrays.npz', *options)
-    assert (done.code, done.err) == (0, '')
-    assert 'warning: positions: 12, expected at least 20' in done.out
-    assert re.search(r'left-out pilots after: [\d.]+ m rms, 0 of 12 without a fix', done.out)
-    for values, error in (
-            (positions.astype(str), 'of type <U32, expected numbers'),
-            (1000 * positions, 'expected at most its longest side, 10 m, in metres')):
-        np.savez(tmp_path / 'arrays.npz', positions=values, received=received)
-        done = call(tmp_path / 'arrays.npz', *options)
-        assert done.code == 2 and error in done.err
-        assert len(done.err.splitlines()) == 1
-        assert not (tmp_path / 'hall.npz.jobs').exists()
-    np.savez(tmp_path / 'arrays.npz', positions=positions)
-    done = call(tmp_path / 'arrays.npz', *options)
-    assert done.code == 2
-    assert 'received: missing' in done.err
-
-
-def test_a_calibration_that_makes_errors_larger_is_called_so(two_folds, tmp_path):
-    rng = np.random.default_rng(0)
-    positions = SCENARIO.sample_positions(20, rng)
-    received = simulate_received(SCENARIO, CODEBOOK, positions, rng)
-    # Positions that are known to 10 cm do not suffice.
-    np.savez(tmp_path / 'arrays.npz', received=received,
-             positions=positions + 0.1 * rng.standard_normal(positions.shape))
-    done = call(tmp_path / 'arrays.npz', '--config', CONFIG / 'quick.yaml', '--codebook',
-                CONFIG / 'codebook_quick.yaml', '--output', tmp_path / 'surface.npz')
-    assert done.code == 0
-    assert done.out.splitlines()[-2] == (
-        'warning: significantly more left-out pilots are located worse after it than better')
-
-
-def test_boards_are_compared_and_the_best_one_is_fitted(tmp_path, capsys):
-    rng = np.random.default_rng(0)
-    lossy = dataclasses.replace(SCENARIO, board={'kind': 'paper', 'loss_db_per_m': 20.0})
-    positions = SCENARIO.sample_positions(40, rng)
-    np.savez(tmp_path / 'arrays.npz', positions=positions,
-             received=simulate_received(lossy, CODEBOOK, positions, rng))
-    options = (tmp_path / 'arrays.npz', '--config', CONFIG / 'quick.yaml', '--codebook',
-               CONFIG / 'codebook_quick.yaml', '--output', tmp_path / 'x.npz', '--board')
-    done = call(*options, 'resonant', '{kind: paper, loss_db_per_m: 9}', '--fit', 'loss_db_per_m')
-    assert (done.code, done.err) == (0, '')
-    lines = done.out.splitlines()
-    assert lines[0] == '{kind: paper, loss_db_per_m: 9.0}: log evidence 0.0'
-    assert lines[1].startswith('paper: log evidence -')
-    assert lines[2].startswith('resonant: log evidence -')
-    value, std = map(float, re.match(
-        r'loss_db_per_m: ([\d.]+) \+- ([\d.]+); row of the covariance: ', lines[3]).groups())
-    assert abs(value - 20) < 3 * std < 15
-    board = re.fullmatch(r'log evidence [\d.]+ with the line "board: (.*)" in the scenario file',
-                         lines[4])[1]
-    assert float(re.search('loss_db_per_m: ([^}]+)}', board)[1]) == pytest.approx(value)
-    assert not (tmp_path / 'x.npz.jobs').exists()
-    done = call(*options, '--fit', 'masked')
-    assert (done.code, done.out) == (2, 'paper: log evidence 0.0\n')
-    assert "masked: expected a field of the board 'paper'" in done.err
-    assert len(done.err.splitlines()) == 1
-    for wrong, error in (((*options, 'none'), "argument --board: 'none', expected a plug-in"),
-                         ((*options[:-1], '--fit', 'masked'), 'together with --board')):
-        with pytest.raises(SystemExit):
-            calibrate.main([*map(str, wrong)])
-        assert error in capsys.readouterr().err
-
-
 def test_pilots_of_a_site_have_the_true_positions_of_its_leading_surface(
         record, tmp_path, monkeypatch):
     """The other surfaces record none."""
@@ -236,8 +157,7 @@ def test_an_interrupted_calibration_continues_in_other_processes(calibrated, rec
 
 @pytest.mark.parametrize(('arguments', 'error'), [
     (['--namespace', '/lab'], f'in the namespace /lab; --namespace selects one of {NAMESPACE}'),
-    (['--namespace', NAMESPACE, '--config', CONFIG / 'table1.yaml'], ': shape '),
-    (['--states=1,-1'], 'run.mcap: expected no file with --states')])
+    (['--namespace', NAMESPACE, '--config', CONFIG / 'table1.yaml'], ': shape ')])
 def test_an_unusable_recording_is_named(recording, tmp_path, arguments, error):
     done = call(recording, '--output', tmp_path / 'x.npz', *arguments)
     assert done.code == 2
@@ -245,33 +165,6 @@ def test_an_unusable_recording_is_named(recording, tmp_path, arguments, error):
     assert error in done.err
     assert len(done.err.splitlines()) == 1
     assert not list(tmp_path.iterdir())
-
-
-def test_known_states_need_no_pilots(tmp_path):
-    file = tmp_path / 'states.npz'
-    done = call('--config', CONFIG / 'quick.yaml', '--states=0.5+0.5j,-1', '--output', file)
-    calibration = Calibration.load(file)
-    assert (done.code, done.out) == (0, f'{file}: calibration {calibration.id}\n')
-    assert calibration.surface.applied(np.array([0.0] + [1.0] * 35)).tolist() == [
-        0.5 + 0.5j, *[-1] * 35]
-
-
-def test_a_full_disk_keeps_an_existing_file(tmp_path, monkeypatch, capsys, full_disk):
-    file = tmp_path / 'states.npz'
-    file.write_text('old', encoding='utf-8')
-    monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
-    with full_disk(10):
-        assert calibrate.main(['--states=1,-1', '--output', str(file)]) == 1
-    assert capsys.readouterr() == ('', f"calibrate: error: [Errno 27] File too large: '{file}'\n")
-    assert [(path, path.read_text(encoding='utf-8')) for path in tmp_path.iterdir()] == [
-        (file, 'old')]
-
-
-@pytest.mark.parametrize('states', ['1', '1,2,3', '1,x', 'nan,1', ''])
-def test_states_are_two_numbers(states, capsys):
-    with pytest.raises(SystemExit):
-        calibrate.main([f'--states={states}'])
-    assert f'--states: {states!r}, expected two numbers such as 1,-1' in capsys.readouterr().err
 
 
 # The network starts for these tests, and runs until the last one has ended.
