@@ -68,7 +68,7 @@ class Setting:
     prior_std_m: float = 0.0  # of a mixture around the user; 0 without one
     library: Callable[[], Library] = lambda: EMPTY
     radio: Callable[[Scenario, Air], Radio] = EmulatedRadio
-    plan: str = 'bandplan'  # of `frame.SYSTEMS`
+    plan: str = 'bandplan'  # of `frame.system`
     distance_m: float = 10.0  # of the centre of the region from each surface
     period_s: float = 0.1  # of the cycles of a track
 

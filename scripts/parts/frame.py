@@ -37,8 +37,8 @@ from rhs_isac_ros.support.pictures import PICTURE_FORMATS, write_picture
 CONFIG = Path(__file__).parents[2] / 'config'
 # Scenario and codebook of the two systems that most benchmarks compare.
 SYSTEMS = {'table1': ('table1.yaml', 'codebook_ambiguity.yaml'),
-           'bandplan': ('bandplan.yaml', 'codebook_bandplan.yaml'),
-           'lab_walk': ('lab_walk.yaml', 'codebook_lab.yaml')}
+           'bandplan': ('bandplan.yaml', 'codebook_bandplan.yaml')}
+_FILES = {**SYSTEMS, 'lab_walk': ('lab_walk.yaml', 'codebook_lab.yaml')}
 # A value and the ends of its 95 % interval.
 Interval = tuple[float, float, float]
 # Squared Mahalanobis radius of the 95 % region of an estimate.
@@ -148,8 +148,8 @@ def add_plans(parser: ArgumentParser, known: Sequence[str]) -> None:
 
 
 def system(name: str) -> tuple[Scenario, Codebook]:
-    """Load a scenario of `SYSTEMS` and its codebook."""
-    scenario, codebook = SYSTEMS[name]
+    """Load a scenario and its codebook: one of `SYSTEMS`, or the walking users of the lab."""
+    scenario, codebook = _FILES[name]
     return Scenario.from_yaml(CONFIG / scenario), Codebook.load(CONFIG / codebook)
 
 

@@ -36,6 +36,13 @@ if __name__ == '__main__':
 '''
 
 
+@pytest.mark.parametrize('name', frame.SYSTEMS)
+def test_the_systems_that_benchmarks_compare_share_the_spectrum_of_the_paper(name):
+    """The plans of `bandplan`, and the traced channels of `channels`, have this spectrum."""
+    scenario, _ = frame.system(name)
+    assert all(2.5e9 <= one <= 3e9 for one in scenario.center_frequencies_hz)
+
+
 def test_errors_are_those_of_the_fixes():
     mean = np.array([[1.0, 0, 0], [np.nan] * 3, [0, 6.0, 0]])
     covariance = np.stack([np.eye(3), np.full((3, 3), np.nan), 4 * np.eye(3)])
