@@ -66,6 +66,13 @@ def test_each_reason_leaves_out_a_command(by_page):
         assert any(re.match(pattern, command) for command in every), pattern
 
 
+def test_the_tutorial_removes_all_its_files_at_its_end(by_page):
+    *commands, last = by_page['tutorial.rst']
+    assert last.startswith('rm -f ')
+    used = re.findall(r'[ =/](\w+\.(?:yaml|png|mcap))\b', '\n'.join(commands))
+    assert {*used, 'demo.png'} == {*last.split()[2:]}
+
+
 def test_quick_commands_run_as_the_pages_state(by_page, built_scripts, tmp_path):
     n_run = 0
     for name, found in by_page.items():
