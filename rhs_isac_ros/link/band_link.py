@@ -55,33 +55,29 @@ def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BandLink:
-    """The link between the surface and a user in one band, or the links in several bands.
+    """The links between the surface and a user in the n_b bands of a choice.
 
-    For several bands, all arrays have a leading axis for the band, and methods take
-    configurations, float64 [N_B, n, N_E]. For one band, methods take float64 [..., N_E].
+    Methods take configurations, float64 [n_b, n, N_E], or [N_E] for one in all bands, with n = 1.
     """
 
-    onboard: np.ndarray  #: B_j with the gain of the band, complex128 [N_SB, K, N_E].
-    los: np.ndarray  #: Line-of-sight gains, complex128 [N_SB, N_E].
+    onboard: np.ndarray  #: B_j with the gain of the band, complex128 [n_b, N_SB, K, N_E].
+    los: np.ndarray  #: Line-of-sight gains, complex128 [n_b, N_SB, N_E].
     spatial: SpatialCovariance  #: V_i.
     noise_power_w: float  #: Noise power of a sub-band [W].
     power_w: float  #: Power of the digital part, summed over sub-bands [W].
-    slope: np.ndarray  #: Slopes of the coefficients in the configuration, [N_E].
-    offset: np.ndarray  #: Coefficients for the configuration 0, [N_E].
+    slope: np.ndarray  #: Slopes of the coefficients in the configuration, [n_b, N_E].
+    offset: np.ndarray  #: Coefficients for the configuration 0, [n_b, N_E].
 
     @classmethod
-    def to(cls, scenario: Scenario, position: np.ndarray, bands: int | Sequence[int],
+    def to(cls, scenario: Scenario, position: np.ndarray, bands: Sequence[int],
            surface: SurfaceEstimate | None = None) -> 'BandLink':
         """Return the links to a position, float64 [3] [m], in the given bands, counted from 0.
 
         Raises ValueError if the position is not a finite [3] array.
         """
         onboard, slope, offset = arrays(scenario, surface)
-        listed, place = np.atleast_1d(bands).tolist(), checked_position(position)[None]
-        los = np.concatenate([los_gain(scenario, place, band) for band in listed])
-        if isinstance(bands, int):
-            los = los[0]
-        index = band_index(bands)
+        place, index = checked_position(position)[None], band_index(bands)
+        los = np.concatenate([los_gain(scenario, place, band) for band in bands])
         return cls(onboard[index], los, spatial_covariance(scenario)[index],
                    scenario.noise_power_w, scenario.max_power_w, slope[index], offset[index])
 
@@ -93,7 +89,7 @@ class BandLink:
             power_w=self.power_w * share)
 
     def best_digital(self, analog: np.ndarray) -> np.ndarray:
-        """Return the best digital part for configurations, complex128 [..., N_SB, K] [sqrt(W)].
+        """Return the best digital parts of configurations, complex128 [n_b, n, N_SB, K] [sqrt(W)].
 
         In each sub-band, it is a multiple of the conjugate of the principal eigenvector of the
         channels' correlation matrix at the feeds. Water-filling divides the power.
@@ -110,17 +106,15 @@ class BandLink:
         return np.log1p(gains * water_filling(gains, self.power_w)).sum(axis=-1)
 
     def feeds(self, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the channels between the feeds and the air for configurations [..., N_E].
+        """Return the channels between the feeds and the air for configurations.
 
-        Returns B_j times the coefficients, complex128 [..., N_SB, K, N_E], its product with V_i,
-        and its product with the line-of-sight gains, complex128 [..., N_SB, K, 1].
+        Returns B_j times the coefficients, complex128 [n_b, n, N_SB, K, N_E], its product with
+        V_i, and its product with the line-of-sight gains, complex128 [n_b, n, N_SB, K, 1].
         """
-        onboard, los, slope, offset = self.onboard, self.los[..., None], self.slope, self.offset
-        if onboard.ndim == 4:
-            onboard, los, slope, offset = (
-                array[:, None] for array in (onboard, los, slope, offset))
-        configured = onboard * (slope * analog + offset)[..., None, None, :]
-        return configured, self.spatial.scatter(configured), np.matmul(configured, los)
+        coefficients = self.slope[:, None] * analog + self.offset[:, None]
+        configured = self.onboard[:, None] * coefficients[..., None, None, :]
+        direct = np.matmul(configured, self.los[:, None, ..., None])
+        return configured, self.spatial.scatter(configured), direct
 
     @staticmethod
     def correlations(
@@ -130,10 +124,8 @@ class BandLink:
                 + np.matmul(scattered, np.conj(np.swapaxes(configured, -1, -2))))
 
 
-def band_index(bands: int | Sequence[int]) -> int | slice | list[int]:
+def band_index(bands: Sequence[int]) -> slice | list[int]:
     """Return an array index that selects bands; if possible a slice, which avoids a copy."""
-    if isinstance(bands, int):
-        return bands
     first, n = bands[0], len(bands)
     return slice(first, first + n) if list(bands) == list(range(first, first + n)) else list(bands)
 

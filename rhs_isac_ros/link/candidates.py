@@ -59,7 +59,7 @@ class Tables(NamedTuple):
 
 
 def candidate_configurations(
-        tables: Tables, link: BandLink, index: int | slice | list[int], n: int) -> np.ndarray:
+        tables: Tables, link: BandLink, index: slice | list[int], n: int) -> np.ndarray:
     """Find n configurations of high capacity per band, float64 [N_B, n, N_E] of zeros and ones.
 
     By the holographic principle, a configuration enables the elements at which a wave on the

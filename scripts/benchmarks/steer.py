@@ -111,7 +111,7 @@ def long_optimisation(
     for it. The best few ascents are refined by flipping single elements until no flip increases
     the capacity.
     """
-    link = BandLink.to(scenario, position, band)
+    link = BandLink.to(scenario, position, [band])
     ends = []
     for number in range(STARTS):
         start = rng.uniform(size=scenario.n_elements)
@@ -121,20 +121,21 @@ def long_optimisation(
         ends.append(np.clip(result.x, 0, 1))
     ends.sort(key=link.best_rate, reverse=True)
     analog = max((refine(link, end) for end in ends[:REFINED]), key=link.best_rate)
-    return rate_bps(scenario, Beamformer(analog, link.best_digital(analog), band), position)
+    return rate_bps(scenario, Beamformer(analog, link.best_digital(analog)[0, 0], band), position)
 
 
 def negative_capacity(link: BandLink) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
     """Return the negative capacity [nat] with its gradient, from the explicit channels."""
-    factor = np.linalg.cholesky(
-        link.spatial.matrix + 1e-12 * np.trace(link.spatial.matrix) * np.eye(link.los.shape[-1]))
+    matrix = link.spatial.matrix[0]
+    factor = np.linalg.cholesky(matrix + 1e-12 * np.trace(matrix) * np.eye(len(matrix)))
+    onboard, los = link.onboard[0], link.los[0]
     # LoS channel and modes of the multipath, [N_SB, N_E, 1 + N_E].
     modes = np.concatenate([
-        link.los[:, :, None], np.broadcast_to(factor, (len(link.los), *factor.shape))], axis=2)
+        los[:, :, None], np.broadcast_to(factor, (len(los), *factor.shape))], axis=2)
 
     def evaluate(analog: np.ndarray) -> tuple[float, np.ndarray]:
-        digital = link.best_digital(analog)
-        feeding = np.matmul(digital[:, None, :], link.onboard)[:, 0] / np.sqrt(link.noise_power_w)
+        digital = link.best_digital(analog)[0, 0]
+        feeding = np.matmul(digital[:, None, :], onboard)[:, 0] / np.sqrt(link.noise_power_w)
         received = np.matmul((feeding * analog)[:, None, :], modes)[:, 0]
         snr = np.sum(np.abs(received)**2, axis=1)
         back = np.matmul(modes, np.conj(received)[:, :, None])[:, :, 0]

@@ -11,11 +11,11 @@ POSITION = np.array([8.0, -2.0, 0.5])
 
 @pytest.mark.parametrize('band', [0, 1])
 def test_the_best_digital_part_matches_the_reference(table1, reference_link, band):
-    link, reference = BandLink.to(table1.scenario, POSITION, band), reference_link(table1, band)
+    link, reference = BandLink.to(table1.scenario, POSITION, [band]), reference_link(table1, band)
     rng = np.random.default_rng(0)
     for analog in (rng.uniform(size=100), np.round(rng.uniform(size=100))):
         expected = reference.best_beam(analog, POSITION)
-        digital = link.best_digital(analog)
+        digital = link.best_digital(analog)[0, 0]
         # The common phase of each sub-band is arbitrary.
         rotation = np.sum(digital * expected.digital.conj(), axis=1, keepdims=True)
         np.testing.assert_allclose(
@@ -24,7 +24,7 @@ def test_the_best_digital_part_matches_the_reference(table1, reference_link, ban
 
 
 def test_the_best_rate_is_the_capacity_of_the_best_digital_part(small, reference_link):
-    link, reference = BandLink.to(small.scenario, POSITION, 0), reference_link(small)
+    link, reference = BandLink.to(small.scenario, POSITION, [0]), reference_link(small)
     analog = np.random.default_rng(0).uniform(size=16)
     expected = reference.capacity(reference.best_beam(analog, POSITION), POSITION)
     assert link.best_rate(analog) * small.scenario.subband_width_hz / np.log(2) == pytest.approx(
@@ -36,18 +36,18 @@ def test_links_in_several_bands_are_those_of_each_band(table1):
     links = BandLink.to(table1.scenario, POSITION, bands)
     analog = np.random.default_rng(0).uniform(size=(2, 3, 100))
     for found, band, configurations in zip(range(2), bands, analog, strict=True):
-        single = BandLink.to(table1.scenario, POSITION, band)
+        single = BandLink.to(table1.scenario, POSITION, [band])
         np.testing.assert_allclose(
-            links.best_rate(analog)[found], single.best_rate(configurations), rtol=1e-12)
+            links.best_rate(analog)[found], single.best_rate(configurations)[0], rtol=1e-12)
         np.testing.assert_allclose(
-            links.best_digital(analog)[found], single.best_digital(configurations), rtol=1e-8)
+            links.best_digital(analog)[found], single.best_digital(configurations)[0], rtol=1e-8)
 
 
 def test_a_sub_band_has_its_share_of_the_power(table1):
     """Sub-bands hardly differ here, so that each one has an eighth of the rate."""
-    link, analog = BandLink.to(table1.scenario, POSITION, 0), np.ones(100)
+    link, analog = BandLink.to(table1.scenario, POSITION, [0]), np.ones(100)
     part = link.at_subbands(np.array([4]))
-    assert part.los.shape == (1, 100)
+    assert part.los.shape == (1, 1, 100)
     assert 8 * part.best_rate(analog) == pytest.approx(link.best_rate(analog), rel=1e-4)
 
 
@@ -64,8 +64,8 @@ def test_phases_drift_little_between_representative_sub_bands():
     chosen = representative_subbands(scenario, 1.0, 64)
     assert 1 < len(chosen) < 16
     for position in scenario.sample_positions(10, np.random.default_rng(0)):
-        link = BandLink.to(scenario, position, 0)
-        paths = link.onboard * link.los[:, None]
+        link = BandLink.to(scenario, position, [0])
+        paths = (link.onboard * link.los[:, :, None])[0]
         rotation = paths[chosen[1:]] * np.conj(paths[chosen[:-1]])
         common = rotation.sum(axis=(1, 2), keepdims=True)
         assert np.abs(np.angle(rotation * np.conj(common))).max() <= 1.0
