@@ -4,10 +4,9 @@ With ``--publish``, it passes them to running nodes instead; see `republish`.
 """
 
 import argparse
-import functools
 import posixpath
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -29,6 +28,7 @@ from rhs_isac_ros.positioning import (
     fuse,
 )
 from rhs_isac_ros.positioning.store import default_folder
+from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.ros.recording import Recorded, RecordingError, read_networks
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
@@ -40,6 +40,8 @@ from rhs_isac_ros.tools.command import ToolError
 
 # Positions, float64 [3] [m], some with velocities, [6] [m, m/s], by cycle and user.
 _Positions: TypeAlias = dict[Key, np.ndarray]
+# Locates a user from its signals at a time [s].
+_Locate: TypeAlias = Callable[[m.ReceivedSignals, float], Estimate]
 
 
 class Recording:
@@ -97,69 +99,60 @@ def load(path: Path, namespace: str = '/', config: Path | None = None,
         '': command.choose_scenario(config, path, namespace, site)})
 
 
+def alone(functions: Mapping[str, Callable[[np.ndarray], Estimate]]) -> _Locate:
+    """Return a function that locates users in single cycles; the keys are ids of codebooks."""
+    return lambda signals, _: functions[signals.codebook_id](signals.stacked)
+
+
+def tracked(estimators: Mapping[str, Estimator], speed_mps: float) -> _Locate:
+    """Return a function that tracks users with a typical speed [m/s] over the cycles."""
+    tracks = Tracks()
+    return lambda signals, now_s: tracks.locate(
+        signals, estimators[signals.codebook_id], speed_mps, now_s)
+
+
+def locate(recording: Recording, locate_user: _Locate) -> _Positions:
+    """Locate the users of a network again; those without a fix have no position."""
+    return {key: _state(found) for key, found in zip(
+        recording.truths, _estimates(recording, locate_user), strict=True)
+        if found and found.fix}
+
+
+def locate_in_site(
+        recording: Recording, bounds_m: np.ndarray, table_folder: Path | None = None
+) -> dict[str, _Positions]:
+    """Locate the users of a site again; return the positions by surface, '' for the fusion."""
+    # In the order of the node `fusion`.
+    names, leader = sorted(filter(None, recording.logs)), recording.scenarios['']
+    posteriors = [_estimates(recording, alone({
+        codebook_id: BayesEstimator(System(recording.scenarios[name], codebook), table_folder,
+                                    reject_outside=True).posterior
+        for codebook_id, codebook in _codebooks(recording, name).items()}), name)
+        for name in names]
+    again: dict[str, _Positions] = {name: {} for name in (*names, '')}
+    for key, *found in zip(recording.truths, *posteriors, strict=True):
+        sightings = [sighting for one in found if one and (sighting := one.sighting)]
+        fused = fuse(sightings, bounds_m, leader.outside_probability,
+                     leader.user_speed_std_mps) if sightings else None
+        for name, one in zip(again, (*found, fused), strict=True):
+            if one and one.fix:
+                again[name][key] = _state(one)
+    return again
+
+
+def _estimates(
+        recording: Recording, locate_user: _Locate, name: str = '') -> Iterator[Estimate | None]:
+    """Yield estimates in all cycles, None without signals, in the frame of the site."""
+    log, pose = recording.logs[name], recording.scenarios[name].pose
+    for key in recording.truths:
+        signals = log.signals.get(key)
+        yield None if signals is None else locate_user(
+            signals, signals.time_s(log.arrived_s[key])).to_site(pose)
+
+
 def _state(estimate: Estimate) -> np.ndarray:
     state = np.append(estimate.mean, estimate.velocity)
     return state[np.isfinite(state)]
-
-
-def locate(
-        recording: Recording, estimators: Mapping[str, Estimator],
-        track_speed_mps: float | None = None) -> _Positions:
-    """Locate the users of a network again; those without a fix have no position.
-
-    The keys of `estimators` are ids of codebooks. If the typical speed `track_speed_mps` [m/s] is
-    given, users are tracked over the cycles.
-    """
-    tracks, log, found = Tracks(), recording.logs[''], {}
-    for key in recording.truths:
-        signals = log.signals[key]
-        estimator = estimators[signals.codebook_id]
-        estimate = estimator.estimate(signals.stacked) if track_speed_mps is None else (
-            tracks.locate(signals, estimator, track_speed_mps,
-                          signals.time_s(log.arrived_s[key])))
-        if estimate.fix:
-            found[key] = _state(estimate.to_site(recording.scenarios[''].pose))
-    return found
-
-
-class SiteRecording(Recording):
-    """The recording of a site."""
-
-    def __init__(self, path: Path, namespace: str, networks: Recorded) -> None:
-        self._networks = networks
-        leader = next(iter(networks.surfaces.values()))
-        super().__init__(path, namespace, {**networks.surfaces, '': leader})
-
-    def located(self, table_folder: Path | None = None) -> dict[str, _Positions]:
-        """Locate the users again from the recorded signals; return the positions by name."""
-        find = functools.cache(functools.partial(self._estimator, table_folder))
-        again: dict[str, _Positions] = {name: {} for name in self.logs}
-        leader = next(iter(self._networks.surfaces.values()))
-        for key in self.truths:
-            sightings = []
-            # In the order of the node `fusion`.
-            for name, scenario in sorted(self._networks.surfaces.items()):
-                signals = self.logs[name].signals.get(key)
-                if signals is None:
-                    continue
-                posterior = find(name, signals.codebook_id).posterior(signals.stacked)
-                if sighting := posterior.sighting:
-                    sightings.append(sighting)
-                if posterior.fix:
-                    again[name][key] = _state(posterior.to_site(scenario.pose))
-            if sightings and (fused := fuse(
-                    sightings, self._networks.bounds_m, leader.outside_probability,
-                    leader.user_speed_std_mps)).fix:
-                again[''][key] = _state(fused)
-        return again
-
-    def _estimator(self, folder: Path | None, name: str, codebook_id: str) -> BayesEstimator:
-        if codebook_id not in self.logs[name].codebooks:
-            raise RecordingError(
-                f'{self.path}: codebook {codebook_id} of {name}: not in the recording')
-        system = System(
-            self._networks.surfaces[name], self.logs[name].codebooks[codebook_id])
-        return BayesEstimator(system, folder, reject_outside=True)
 
 
 def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
@@ -175,13 +168,13 @@ def _replay_site(options: argparse.Namespace, networks: Recorded) -> int:
         names = ', '.join(f'{options.namespace.rstrip("/")}/{name}' for name in surfaces)
         raise ToolError(f'--{given[0]}: not available for a whole site; select a surface with '
                         f'--namespace: {names}')
-    recording = SiteRecording(options.file, options.namespace, networks)
+    leader = next(iter(networks.surfaces.values()))
+    recording = Recording(options.file, options.namespace, {**networks.surfaces, '': leader})
     command.print_now(f'{len(recording.truths)} cycles')
-    again = recording.located(default_folder())
-    rows = [_row(f'{label}{name or "fusion"}', recording, positions)
-            for name, found in again.items()
-            for label, positions in (('live ', recording.live(name)), ('', found))]
-    _print_table(rows)
+    again = locate_in_site(recording, networks.bounds_m, default_folder())
+    _print_table([
+        _row(f'{label}{name or "fusion"}', recording, positions) for name in recording.logs
+        for label, positions in (('live ', recording.live(name)), ('', again[name]))])
     return 0
 
 
@@ -233,7 +226,8 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
         library = Library.load(options.library)
         library.check(scenario)
         log.codebooks.update(library.by_id)
-    codebooks = _codebooks(recording, options.codebook)
+    codebooks = _codebooks(
+        recording, given=options.codebook and Codebook.load(options.codebook, scenario))
     names = sorted({estimate.estimator for estimate in log.estimates.values()})
     command.print_now(f'{len(recording.truths)} cycles')
     rows = [_row(f'live {", ".join(names)}', recording, recording.live())]
@@ -243,10 +237,11 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
                                  reject_outside=True) | further
         estimators = {codebook_id: kind.create(System(scenario, codebook, surface), **accepted)
                       for codebook_id, codebook in codebooks.items()}
-        rows.append(_row(kind.name, recording, locate(recording, estimators)))
+        rows.append(_row(kind.name, recording, locate(recording, alone({
+            key: one.estimate for key, one in estimators.items()}))))
         if options.track and kind.uses_tracks:
-            rows.append(_row('track', recording, locate(
-                recording, estimators, options.track_speed or Motion.speed_mps)))
+            rows.append(_row('track', recording, locate(recording, tracked(
+                estimators, options.track_speed or Motion.speed_mps))))
     _print_table(rows)
     return 0
 
@@ -266,21 +261,20 @@ def _row(name: str, recording: Recording, positions: _Positions) -> list[str]:
             f'{np.sqrt(np.mean(speeds**2)):.6f} m/s' if len(speeds) else '']
 
 
-def _codebooks(recording: Recording, file: Path | None) -> dict[str, Codebook]:
-    """Return the codebooks to assume, by the id of the recorded codebook."""
-    log = recording.logs['']
-    used = sorted({log.signals[key].codebook_id for key in recording.truths})
-    if file:
-        codebook = Codebook.load(file, recording.scenarios[''])
-        for codebook_id in used:
-            if codebook_id != codebook.id:
-                print(f'signals received with codebook {codebook_id} are evaluated with '
-                      f'{codebook.id}', file=sys.stderr)
-        return dict.fromkeys(used, codebook)
+def _codebooks(
+        recording: Recording, name: str = '', given: Codebook | None = None
+) -> dict[str, Codebook]:
+    """Return the codebooks to assume for a surface, by the id of the recorded codebook."""
+    log = recording.logs[name]
+    used = sorted({signals.codebook_id for key, signals in log.signals.items()
+                   if key in recording.truths})
     for codebook_id in used:
-        if codebook_id not in log.codebooks:
+        if given and codebook_id != given.id:
+            print(f'signals received with codebook {codebook_id} are evaluated with {given.id}',
+                  file=sys.stderr)
+        if not given and codebook_id not in log.codebooks:
             raise command.missing_codebook(recording.path, codebook_id)
-    return {codebook_id: log.codebooks[codebook_id] for codebook_id in used}
+    return {codebook_id: given or log.codebooks[codebook_id] for codebook_id in used}
 
 
 def _estimator(text: str) -> EstimatorKind:

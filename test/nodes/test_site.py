@@ -297,10 +297,12 @@ def test_a_recording_holds_each_surface_and_the_fusion(running, recorded):
 
 def test_a_replay_locates_the_users_of_each_surface_and_of_the_fusion_again(recorded, capsys):
     from rhs_isac_ros.ros.recording import read_networks
-    from rhs_isac_ros.tools.replay import SiteRecording, main
+    from rhs_isac_ros.tools.replay import Recording, locate_in_site, main
     path, estimates = recorded
-    recording = SiteRecording(path, '/', read_networks(path))
-    again = recording.located()
+    networks = read_networks(path)
+    recording = Recording(
+        path, '/', {**networks.surfaces, '': next(iter(networks.surfaces.values()))})
+    again = locate_in_site(recording, networks.bounds_m)
     assert again.keys() == recording.logs.keys() == {'front', 'side', ''}
     # With all signals, the positions are the same.
     first = min(again['front'].keys() & again['side'].keys())

@@ -24,7 +24,7 @@ from rhs_isac_ros.ros.endpoints import EXCHANGE, OBSERVATION
 from rhs_isac_ros.ros.recording import read
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.tools import republish
-from rhs_isac_ros.tools.replay import load, locate, main
+from rhs_isac_ros.tools.replay import alone, load, locate, main, tracked
 
 pytest.importorskip('mcap', reason='mcap is not installed')
 CONFIG = Path(__file__).parents[2] / 'config'
@@ -194,8 +194,9 @@ def test_errors_do_not_depend_on_the_pose_of_the_surface(run):
     for pose in (Pose(), Pose((1, 2, 3), (0, 0, 1, 1))):
         placed = dataclasses.replace(recording.scenarios[''], pose=pose)
         recording.scenarios = {'': placed}
-        found = locate(recording, {key: make_estimator('ml', placed, codebook)
-                                   for key, codebook in recording.logs[''].codebooks.items()})
+        found = locate(recording, alone({
+            key: make_estimator('ml', placed, codebook).estimate
+            for key, codebook in recording.logs[''].codebooks.items()}))
         errors_m.append([np.linalg.norm(found[key] - pose.to_site(truth))
                          for key, truth in recording.truths.items()])
     np.testing.assert_allclose(*errors_m, rtol=1e-9)
@@ -206,20 +207,21 @@ def test_users_are_tracked_beside_single_cycles(run, replayed):
     recording = load(run.path)
     estimators = {key: make_estimator('bayes', recording.scenarios[''], codebook)
                   for key, codebook in recording.logs[''].codebooks.items()}
-    alone = recording.errors_m(locate(recording, estimators))
-    states = locate(recording, estimators, 1.0)
-    tracked, velocities = recording.errors_m(states), recording.velocity_errors_mps(states)
+    single = locate(recording, alone({key: one.estimate for key, one in estimators.items()}))
+    states = locate(recording, tracked(estimators, 1.0))
+    single_m, errors_m, velocities = recording.errors_m(single), recording.errors_m(
+        states), recording.velocity_errors_mps(states)
     # Single cycles have no velocity.
-    assert len(velocities) == np.isfinite(tracked).sum()
-    assert not recording.velocity_errors_mps(locate(recording, estimators)).size
+    assert len(velocities) == np.isfinite(errors_m).sum()
+    assert not recording.velocity_errors_mps(single).size
     users = [user for _, user in recording.truths]
     first = [users.index(user) for user in set(users)]
     assert len(first) < len(users)
-    np.testing.assert_array_equal(np.delete(tracked != alone, first), True)
-    np.testing.assert_array_equal(tracked[first], alone[first])
+    np.testing.assert_array_equal(np.delete(errors_m != single_m, first), True)
+    np.testing.assert_array_equal(errors_m[first], single_m[first])
     found, _ = replayed('--track')
     assert found['track'] == [
-        f'{np.median(tracked):.6f}', 'm', f'{np.sqrt(np.mean(tracked**2)):.6f}', 'm', '0',
+        f'{np.median(errors_m):.6f}', 'm', f'{np.sqrt(np.mean(errors_m**2)):.6f}', 'm', '0',
         f'{np.sqrt(np.mean(velocities**2)):.6f}', 'm/s']
 
 
