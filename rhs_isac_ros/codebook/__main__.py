@@ -46,7 +46,7 @@ from rhs_isac_ros.support.arguments import (
     positive_int,
     seed,
 )
-from rhs_isac_ros.support.exits import exit_code_of, finished
+from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.files import save_or_rescue
 from rhs_isac_ros.support.job_commands import add_run_options, unfinished
 from rhs_isac_ros.support.jobs import JobError, Workers
@@ -63,11 +63,10 @@ ERRORS = (JobError, MissingLibraryError, ValueError, ConnectionError, MemoryErro
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, even if Ctrl-C ends the search, or 2 after one of `ERRORS`.
+    """Run the command; return the code of `exit_code_of`, 0 even if Ctrl-C ends the search.
 
     The exit code is 130 if Ctrl-C ends jobs, which writes no codebook. If the first argument is
-    ``library``, the others are those of `library_command`. Raises OSError if a file cannot be
-    written.
+    ``library``, the others are those of `library_command`.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] == ['library']:
@@ -81,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def work() -> None:
         run(options)
-    return finished(work, ERRORS, parser.prog)
+    return exit_code_of(work, ERRORS, parser.prog)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

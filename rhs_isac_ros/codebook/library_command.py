@@ -14,21 +14,18 @@ from rhs_isac_ros.codebook import library
 from rhs_isac_ros.codebook.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, output_file, positive_float
-from rhs_isac_ros.support.exits import finished
+from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.files import save_or_rescue
 from rhs_isac_ros.support.job_commands import add_run_options, unfinished
 from rhs_isac_ros.support.jobs import JobError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, 2 after an error, or 130 after Ctrl-C.
-
-    Raises OSError if the file cannot be written.
-    """
+    """Run the command; return the code of `exit_code_of`."""
     parser = _parser()
     options = parser.parse_args(arguments)
-    return finished(lambda: _run(options), (JobError, ValueError, ConnectionError, MemoryError),
-                    parser.prog)
+    return exit_code_of(
+        lambda: _run(options), (JobError, ValueError, ConnectionError, MemoryError), parser.prog)
 
 
 def _parser() -> ArgumentParser:

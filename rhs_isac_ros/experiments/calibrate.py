@@ -29,7 +29,7 @@ from rhs_isac_ros.model.board import Board
 from rhs_isac_ros.model.boards import board_of
 from rhs_isac_ros.support.arguments import check_distinct, input_file, output_file
 from rhs_isac_ros.support.errors import translated
-from rhs_isac_ros.support.exits import finished
+from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.files import (
     ArchiveError,
     parse_yaml,
@@ -64,8 +64,8 @@ def main(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
             parser.error(f'argument file: {options.file}, expected a file of arrays, {ARRAYS}; '
                          'recordings and networks need scripts/calibrate, with ROS 2')
         estimate(options, Scenario.from_yaml(options.config) if options.config else Scenario())
-    return finished(work, (ValueError,), parser.prog,
-                    failures=(JobError, MissingLibraryError, OSError))
+    return exit_code_of(
+        work, (ValueError,), parser.prog, failures=(JobError, MissingLibraryError))
 
 
 def estimate(options: argparse.Namespace, scenario: Scenario,

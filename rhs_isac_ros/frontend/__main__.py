@@ -13,7 +13,7 @@ from rhs_isac_ros.frontend.opensourceris import COLUMNS, ROWS, OpenSourceRis
 from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.frontend.surface import SurfaceFault
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float, positive_float
-from rhs_isac_ros.support.exits import exit_code_of, finished
+from rhs_isac_ros.support.exits import exit_code_of
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             command.add_argument('--interval', type=nonnegative_float, default=0.2,
                                  help='time for each element [s]')
     options = parser.parse_args(arguments)
-    return finished(lambda: _run(options), (SurfaceFault,), parser.prog)
+    return exit_code_of(lambda: _run(options), (SurfaceFault,), parser.prog)
 
 
 def _run(options: argparse.Namespace) -> int:

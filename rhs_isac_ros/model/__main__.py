@@ -17,16 +17,13 @@ from rhs_isac_ros.support.arguments import (
     positive_float,
     positive_int,
 )
-from rhs_isac_ros.support.exits import exit_code_of, finished
+from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.files import read_yaml, write_archive
 from rhs_isac_ros.support.optional import MissingLibraryError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, or 2 after an error in the arguments or a file.
-
-    Raises OSError if the file cannot be written.
-    """
+    """Run the command; return the code of `exit_code_of`."""
     parser = ArgumentParser(prog='python3 -m rhs_isac_ros.model', description=__doc__)
     kinds = parser.add_subparsers(dest='kind', required=True)
     style = argparse.ArgumentDefaultsHelpFormatter
@@ -50,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for one in (guides, read):
         one.add_argument('--output', type=output_file, required=True, help='file to write')
     options = parser.parse_args(arguments)
-    return finished(
+    return exit_code_of(
         lambda: _run(options), (MissingLibraryError, ValueError, TypeError), parser.prog)
 
 

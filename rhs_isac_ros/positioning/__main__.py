@@ -22,17 +22,14 @@ from rhs_isac_ros.support.arguments import (
     positive_int,
     seed,
 )
-from rhs_isac_ros.support.exits import exit_code_of, finished
+from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.files import save_or_rescue
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.progress import progress_bar
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return its exit code: 0, 2 after an error, or 130 after Ctrl-C.
-
-    Raises OSError if the file cannot be written.
-    """
+    """Run the command; return the code of `exit_code_of`."""
     parser = ArgumentParser(
         prog='python3 -m rhs_isac_ros.positioning', description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
@@ -56,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     check_distinct(parser, options)
     # Errors of scenario and codebook are ValueErrors.
-    return finished(
+    return exit_code_of(
         lambda: _run(options), (ValueError, MemoryError, MissingLibraryError), parser.prog)
 
 

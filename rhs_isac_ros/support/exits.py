@@ -42,13 +42,15 @@ def print_error(error: object, program: str = '') -> None:
 
 
 def exit_code_of(
-        main: Callable[[], int | None], errors: tuple[type[Exception], ...] = (),
-        program: str = '') -> int:
-    """Run a main function and return the exit code, even if a standard stream is closed or fails.
+        work: Callable[[], int | None], errors: tuple[type[Exception], ...] = (),
+        program: str = '', *, failures: tuple[type[Exception], ...] = (),
+        interrupted: int = 130) -> int:
+    """Do the work of a command and return the exit code, even if a standard stream is closed.
 
-    The code is the result of `main` (0 for None); 0 if the reader of the output closes it early,
-    as ``head`` does; 1 if the output or a file cannot be written; or 2 if `main` raises one of the
-    `errors`. In the last two cases, the error is printed. Other exceptions propagate.
+    The code is the result of `work` (0 for None), 1 after one of the `failures` or if a file or
+    the output cannot be written, 2 after one of the `errors`, `interrupted` after Ctrl-C, or 0 if
+    the reader of the output closes it early, as ``head`` does. Failures and errors are printed
+    after the name of the program. Other exceptions propagate.
     """
     # If a standard stream is closed, the next file to be opened would take its descriptor.
     for name, mode in (('stdin', 'r'), ('stdout', 'w'), ('stderr', 'w')):
@@ -57,44 +59,29 @@ def exit_code_of(
     if isinstance(sys.stdout, io.TextIOWrapper):
         # The encoding of a locale may lack characters of a table.
         sys.stdout.reconfigure(errors='backslashreplace')
+    failures = (OSError, *failures)
     try:
         try:
-            return main() or 0
+            return work() or 0
         finally:
             sys.stdout.flush()
+    except KeyboardInterrupt:
+        return interrupted
     except BrokenPipeError:
-        discard_stdout()
+        _discard_output()
         return 0
     except errors as error:
         print_error(error, program)
         return 2
-    except OSError as error:
-        discard_stdout()
+    except failures as error:
+        _discard_output()
         print_error(error, program)
         return 1
 
 
-def finished(
-        work: Callable[[], int | None], errors: tuple[type[Exception], ...], program: str, *,
-        failures: tuple[type[Exception], ...] = (), interrupted: int = 130) -> int:
-    """Do the work of a command, and return the exit code.
-
-    The code is the result of `work` (0 for None), 1 after one of the `failures`, 2 after one of
-    the `errors`, `interrupted` after Ctrl-C, or 0 if the reader of the output closes it early.
-    Failures and errors are printed.
-    """
+def _discard_output() -> None:
+    """Discard the output if it cannot be written, so that Python can flush it at exit."""
     try:
-        return work() or 0
-    except KeyboardInterrupt:
-        return interrupted
-    except BrokenPipeError:
-        discard_stdout()
-        return 0
-    except (*failures, *errors) as error:
-        print_error(error, program)
-        return 1 if isinstance(error, failures) else 2
-
-
-def discard_stdout() -> None:
-    """Redirect the standard output to `os.devnull`, so that Python can flush it at exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -27,7 +27,7 @@ from rhs_isac_ros.ros.run import StartError, parse, spin
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import check_distinct
 from rhs_isac_ros.support.errors import translated
-from rhs_isac_ros.support.exits import finished
+from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.jobs import JobError
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.system import SystemFileError, fill_in
@@ -82,8 +82,8 @@ def entry(
             fill_in(options)
             check_distinct(parser, options)
             return work(options, [parser.prog, *arguments])
-        return finished(checked, INVALID, parser.prog, interrupted=0,
-                        failures=(ToolError, JobError, MissingLibraryError, OSError))
+        return exit_code_of(checked, INVALID, parser.prog, interrupted=0,
+                            failures=(ToolError, JobError, MissingLibraryError))
     return main
 
 

@@ -20,22 +20,17 @@ def test_an_error_names_the_program_of_the_process_by_default(spec, expected, mo
     assert capsys.readouterr().err == expected
 
 
-def test_an_error_of_the_user_names_the_program(capsys):
-    def fail():
-        raise LookupError('no such place')
-    assert exits.exit_code_of(fail, (LookupError,), 'lab') == 2
-    assert capsys.readouterr().err == 'lab: error: no such place\n'
-
-
 @pytest.mark.parametrize(('result', 'code', 'text'), [
     (None, 0, ''), (1, 1, ''), (LookupError('no such place'), 2, 'lab: error: no such place\n'),
+    (OSError('disk full'), 1, 'lab: error: disk full\n'),
+    (EOFError('no answer'), 1, 'lab: error: no answer\n'), (BrokenPipeError(), 0, ''),
     (KeyboardInterrupt(), 130, '')])
 def test_the_end_of_a_command(result, code, text, capsys):
     def work():
         if isinstance(result, BaseException):
             raise result
         return result
-    assert exits.finished(work, (LookupError,), 'lab') == code
+    assert exits.exit_code_of(work, (LookupError,), 'lab', failures=(EOFError,)) == code
     assert capsys.readouterr().err == text
 
 
