@@ -70,36 +70,25 @@ def load(group: str, plugin: Any, base: type | None = None) -> Any:
     name = name_of(plugin)
     if name in GIVEN:
         return GIVEN[name]
-    if not is_reference(name):
-        return _of_entry_point(group, name)
-    module, _, attribute = name.partition(':')
-    if base and module.partition('.')[0] in sys.stdlib_module_names:
+    module, is_named, attribute = name.partition(':')
+    if base and is_named and module.partition('.')[0] in sys.stdlib_module_names:
         raise PluginError(f'{name}: expected a module outside of the standard library')
-    try:
-        found = attrgetter(attribute)(import_module(module))
-    # Importing a module of somebody else may raise any exception.
-    except Exception as error:
-        raise PluginError(f'{name}: cannot be loaded: {type(error).__name__}: {error}') from error
-    if base and not isinstance(found, base) and not (
-            isinstance(found, type) and issubclass(found, base)):
-        raise PluginError(f'{name}: {found!r}, expected a subclass of {base.__name__}')
-    return found
-
-
-def _of_entry_point(group: str, name: str) -> Any:
-    points = tuple(metadata.entry_points(group=group, name=name))
-    if not points:
+    points = () if is_named else tuple(metadata.entry_points(group=group, name=name))
+    if not (points or is_named):
         installed = ', '.join(names(group)) or 'none'
         raise PluginError(f'{name!r}, expected a plug-in of {group}; installed: {installed}')
     if len(points) > 1:
         raise PluginError(f'{name!r}: {describe(group, name)}, expected one')
     try:
-        return points[0].load()
-    # Importing a module of another package may raise any exception.
+        found = attrgetter(attribute)(import_module(module)) if is_named else points[0].load()
+    # Importing a module of somebody else may raise any exception.
     except Exception as error:
-        raise PluginError(
-            f'{describe(group, name)}: cannot be loaded: {type(error).__name__}: {error}'
-        ) from error
+        raise PluginError(f'{describe(group, name)}: cannot be loaded: {type(error).__name__}: '
+                          f'{error}') from error
+    if base and is_named and not isinstance(found, base) and not (
+            isinstance(found, type) and issubclass(found, base)):
+        raise PluginError(f'{name}: {found!r}, expected a subclass of {base.__name__}')
+    return found
 
 
 def make(group: str, plugin: Any, kind: type, /, *arguments: Any, in_file: bool = False,
