@@ -494,9 +494,8 @@ class Network:
                 return RhsController(library)
             case 'user':
                 return user_role.User(
-                    self._mobilities[name], step_s, BEACON_TIMEOUT_S,
-                    self.instances[name], self.world_s, scenario.pose,
-                    -frame_times_s(scenario)[0, 0])
+                    self._mobilities[name], scenario, step_s, BEACON_TIMEOUT_S,
+                    self.instances[name], self.world_s)
             case 'channel':
                 # Two channels differ in their multipath. Without memory, the expected signals
                 # depend on the seed alone.

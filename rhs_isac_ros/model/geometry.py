@@ -111,6 +111,16 @@ def frame_times_s(scenario: Scenario) -> np.ndarray:
     return read_only(times - times.mean())
 
 
+def reference_s(scenario: Scenario) -> float:
+    """Return the time from the first frame of a cycle to the reference time [s]."""
+    return float(-frame_times_s(scenario)[0, 0])
+
+
+def frames_s(scenario: Scenario) -> float:
+    """Return the time from the first frame of a cycle to the last one [s]."""
+    return float(np.ptp(frame_times_s(scenario)))
+
+
 def stands_still(scenario: Scenario, speed_mps: float) -> bool:
     """Return whether a user with this speed may be taken for one at rest.
 
@@ -118,12 +128,12 @@ def stands_still(scenario: Scenario, speed_mps: float) -> bool:
     cycle to the last one.
     """
     turn = 2 * np.pi * max(scenario.center_frequencies_hz) / SPEED_OF_LIGHT_MPS
-    return bool(turn * speed_mps * np.ptp(frame_times_s(scenario)) < _AT_REST_RAD)
+    return bool(turn * speed_mps * frames_s(scenario) < _AT_REST_RAD)
 
 
 def undeclared_movement(scenario: Scenario) -> str:
     """Return a warning if users may move in a cycle, and no velocity is declared; otherwise ''."""
-    speed_mps, duration_s = scenario.max_user_speed_mps, np.ptp(frame_times_s(scenario))
+    speed_mps, duration_s = scenario.max_user_speed_mps, frames_s(scenario)
     if scenario.user_speed_std_mps or stands_still(scenario, speed_mps):
         return ''
     return (f'user_speed_std_mps: 0, but users of max_user_speed_mps = {speed_mps:g} m/s move by '

@@ -15,7 +15,7 @@ from rclpy.time import Time
 from rhs_isac_ros.model import Pose, mobility
 from rhs_isac_ros.model.arrays import position_problem
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
-from rhs_isac_ros.model.geometry import frame_times_s
+from rhs_isac_ros.model.geometry import reference_s
 from rhs_isac_ros.model.pose import rotation_matrix
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.user import User
@@ -196,10 +196,10 @@ class UserNode(RoleNode[User]):
         super().__init__('user', name, **node_options)
         values = self.values
         mobilities = self._mobilities()
-        self._reference_s = float(-frame_times_s(self.scenario)[0, 0])
+        self._reference_s = reference_s(self.scenario)
         self.start(User(
-            mobilities, values.step_timeout_s, values.beacon_timeout_s, self.instance,
-            self.clocks.world_s, self.scenario.pose, self._reference_s))
+            mobilities, self.scenario, values.step_timeout_s, values.beacon_timeout_s,
+            self.instance, self.clocks.world_s))
         self._true_odometry = endpoints.UserTopics(
             self, {topics.TRUE_ODOMETRY: Odometry}, values.user_topics)
         # On the clock of ROS, like the mobilities.

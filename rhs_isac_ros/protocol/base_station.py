@@ -12,7 +12,7 @@ import numpy as np
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.codebook.library import EMPTY, Library
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.geometry import frame_times_s
+from rhs_isac_ros.model.geometry import frames_s
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.admission import Admission
@@ -119,7 +119,7 @@ class BaseStation(SignalCollector):
             world_s: Callable[[], float] | None = None) -> None:
         super().__init__(BsState.WAITING, scenario, seed, Cycle(first_cycle_id - 1))
         self._users = UserRegistry(settings.policy, rng)
-        self._frames_s = float(np.ptp(frame_times_s(scenario)))
+        self._frames_s = frames_s(scenario)
         self._settings = PendingSettings(settings)
         self._admission = _admission(settings)
         self._pause_requested = False  # whether a pause begins after the current cycle

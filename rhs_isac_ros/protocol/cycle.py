@@ -8,7 +8,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.geometry import frame_times_s
+from rhs_isac_ros.model.geometry import reference_s
 from rhs_isac_ros.model.measurement import receive_feeds
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Outcome
@@ -49,7 +49,7 @@ class SignalCollector(StateMachine):
         self._scenario, self._seed, self._cycle = scenario, seed, cycle
         self._bands = frozenset(range(scenario.n_bands))
         # Time from the first frame to the reference time of the cycle [ns].
-        self._reference_ns = round(-1e9 * frame_times_s(scenario)[0, 0])
+        self._reference_ns = round(1e9 * reference_s(scenario))
 
     def _silent_bands(self) -> list[int]:
         """Return the bands whose signals are missing, in ascending order."""

@@ -52,8 +52,8 @@ class BaseStationSettings(ReceiverSettings):
         0.1, 'Time to wait for acks.', unit='s', low=0.001, high=60.0)
     # Not dynamic, because a change would not reach the users, which have the same timeout.
     step_timeout_s: float = setting(
-        1.0, 'Time to wait for the next message of a cycle, including repetitions. Each request '
-        'for pilots has the time of all frames in addition.', unit='s', low=0.01, high=60.0,
+        1.0, 'Time to wait for the next message of a cycle, including repetitions. Signals have '
+        'the time of all frames in addition.', unit='s', low=0.01, high=60.0,
         dynamic=False)
     retries: int = setting(
         3, 'Maximum number of times that a step is repeated within step_timeout_s.',

@@ -6,14 +6,15 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from rhs_isac_ros.model import Pose
+from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model.geometry import frames_s, reference_s
 from rhs_isac_ros.model.mobility import Crowd, Mobility
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Event, Outcome, PeersChanged, Timeout
 from rhs_isac_ros.protocol.role import ANY, REMEMBERED_CYCLES, NewestDict, Row, StateMachine, on
 
 # Number of consecutive steps in which a granted user may receive nothing: the steps that wait for
-# the signals of the last band, the position, the beam and the data.
+# the signals, the position, the beam and the data. The frames take their time in addition.
 _SILENT_STEPS = 4
 
 
@@ -41,17 +42,15 @@ class User(StateMachine):
     ----------
     mobilities
         Mobility of each user in the frame of the surface, by id; ids start at 1.
+    scenario
+        Declares the pose of the surface, and the times of the frames of a cycle. Positions in
+        cycles apply to its reference time: users move straight until then.
     step_s, beacon_s
         Time that the base station waits for each step, and time without a beacon after which the
         user logs a warning [s].
     world_s
         Callable that returns the time for the mobilities [s]; by default, they use the time passed
         to `handle`.
-    pose
-        Pose of the surface.
-    reference_s
-        Time from the grant to the reference time of the cycle [s], to which positions in cycles
-        apply: users move straight until then.
     """
 
     SENDS = (m.Ack, m.GroundTruth, m.GroundTruths, m.Pilot, m.Data)
@@ -60,16 +59,15 @@ class User(StateMachine):
     BLOCKED_STATES = frozenset({UserState.DISCONNECTED, UserState.NO_BEACON})
 
     def __init__(
-            self, mobilities: Mapping[int, Mobility], step_s: float, beacon_s: float,
-            instance: int = 0, world_s: Callable[[], float] | None = None,
-            pose: Pose | None = None, reference_s: float = 0.0) -> None:
+            self, mobilities: Mapping[int, Mobility], scenario: Scenario, step_s: float,
+            beacon_s: float, instance: int = 0,
+            world_s: Callable[[], float] | None = None) -> None:
         super().__init__(UserState.DISCONNECTED)
         self._step_s, self._beacon_s = step_s, beacon_s
         self.users, self._instance = tuple(sorted(mobilities)), instance
         # Description of another node that is served under the same number, by user.
         self._conflicts: dict[int, str] = {}
-        self._mobilities, self._world_s, self._pose = mobilities, world_s, pose or Pose()
-        self._reference_s = reference_s
+        self._mobilities, self._world_s, self._scenario = mobilities, world_s, scenario
         self._crowd = Crowd([mobilities[user] for user in self.users])
         self._cycle_id = 0
         self._was_connected = False
@@ -87,7 +85,8 @@ class User(StateMachine):
 
     def _in_site(
             self, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self._pose.to_site(position), self._pose.vectors_to_site(velocity)
+        pose = self._scenario.pose
+        return pose.to_site(position), pose.vectors_to_site(velocity)
 
     def _time_s(self, now_s: float) -> float:
         return self._world_s() if self._world_s else now_s
@@ -103,7 +102,7 @@ class User(StateMachine):
         """Return the timeout of a state [s], or None if it has none."""
         timeouts: dict[enum.Enum, float] = {
             UserState.LISTENING: self._beacon_s, UserState.ACKNOWLEDGED: self._step_s,
-            UserState.GRANTED: _SILENT_STEPS * self._step_s}
+            UserState.GRANTED: _SILENT_STEPS * self._step_s + frames_s(self._scenario)}
         return timeouts.get(state)
 
     def status(self) -> Mapping[str, str]:
@@ -199,8 +198,8 @@ class User(StateMachine):
             position, velocity = self._in_site(
                 *self._mobilities[event.user].state(self._time_s(self.now_s)))
             truth = m.derive(
-                m.GroundTruth, event, position=position + self._reference_s * velocity,
-                velocity=velocity)
+                m.GroundTruth, event, velocity=velocity,
+                position=position + reference_s(self._scenario) * velocity)
         self._truths.put(key, truth)
         self.send(truth)
 

@@ -8,6 +8,7 @@ import pytest
 from in_memory_network import Fault, Network
 
 from rhs_isac_ros.model import Pose, Scenario, mobility
+from rhs_isac_ros.model.geometry import frames_s
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BsState
@@ -151,6 +152,16 @@ def test_one_band_and_one_frame_are_enough(random_beams):
     net.run_cycles(3)
     assert net.served() == [1, 1, 1]
     net.verify()
+
+
+def test_a_board_may_take_longer_for_its_frames_than_all_steps(scenario, codebooks, places):
+    slow = dataclasses.replace(scenario, frame_duration_s=1.0)
+    net = Network(slow, codebooks[0], {1: places[1]}, step_timeout_s=0.1, retries=1,
+                  transport=Fault(m.FeedSignals, 'bs', frames_s(slow)))
+    net.run_cycles(2)
+    assert net.served() == [1, 1]
+    assert len(net.sent(m.PilotRequest)) == 2
+    assert not any(net[name].counters for name in ('bs', 'user1'))
 
 
 def test_a_cycle_of_table_1_finds_the_user(shipped, table1_estimator):

@@ -32,15 +32,21 @@ def settings(**values):
         ack_timeout_s=1.0, step_timeout_s=1.0, rest_s=1.0, retries=0, **values)
 
 
+def constructed(scenario, name):
+    """Return the arguments of a machine with timeouts of 1 s."""
+    return {
+        'bs': {'scenario': scenario, 'settings': settings(), 'rng': np.random.default_rng(0),
+               'seed': 0},
+        'user': {'mobilities': {1: mobility.Static((10, 0, 0))}, 'scenario': scenario,
+                 'step_s': 1.0, 'beacon_s': 1.0},
+        'receiver': {'scenario': scenario, 'seed': 0}
+    }.get(name, {})
+
+
 @pytest.fixture
 def machine(scenario, name):
     """The machine of a role, with timeouts of 1 s."""
-    return MACHINES[name](**{
-        'bs': {'scenario': scenario, 'settings': settings(), 'rng': np.random.default_rng(0),
-               'seed': 0},
-        'user': {'mobilities': {1: mobility.Static((10, 0, 0))}, 'step_s': 1.0, 'beacon_s': 1.0},
-        'receiver': {'scenario': scenario, 'seed': 0}
-    }.get(name, {}))
+    return MACHINES[name](**constructed(scenario, name))
 
 
 def reachable(table, start):
@@ -105,13 +111,16 @@ def test_timeouts_alone_lead_to_the_final_state(name, machine):
         assert last[FINAL[name]].restart_timeout
 
 
-def test_each_attempt_at_the_pilots_has_the_time_of_all_frames():
+def test_what_waits_for_signals_has_the_time_of_all_frames():
     scenario = Scenario(frame_duration_s=0.1)
-    machine = bs.BaseStation(scenario, settings(), np.random.default_rng(0), seed=0)
-    n_intervals = scenario.n_bands * scenario.n_frames - 1
-    for state in bs.STEPS:
-        assert machine.timeout_s(state) == pytest.approx(
-            1.0 + 0.1 * n_intervals * (state is BsState.SOUNDING))
+    machines = [MACHINES[name](**constructed(scenario, name)) for name in ('bs', 'user')]
+    waiting = {BsState.SOUNDING: 1.0, user.UserState.GRANTED: 4.0}
+    for machine in machines:
+        for state in (*bs.STEPS, user.UserState.ACKNOWLEDGED, *waiting):
+            if state in machine.STATES:
+                frames_s = 0.1 * (scenario.n_bands * scenario.n_frames - 1)
+                assert machine.timeout_s(state) == pytest.approx(
+                    waiting[state] + frames_s if state in waiting else 1.0)
 
 
 def test_the_base_station_gives_up_exactly_with_the_lost_outcomes():

@@ -5,13 +5,16 @@ import math
 import numpy as np
 import pytest
 
-from rhs_isac_ros.model import mobility
+from rhs_isac_ros.model import Scenario, mobility
+from rhs_isac_ros.model.geometry import reference_s
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, PeersChanged, Send, Timeout
 from rhs_isac_ros.protocol.user import User, UserState
 
 DOWN, UP = m.Direction.DOWNLINK, m.Direction.UPLINK
 OFFERED, DELIVERED = m.Stage.OFFERED, m.Stage.DELIVERED
+# The reference time of its cycles is that of the grant.
+ONE_FRAME = Scenario(center_frequencies_hz=(2.5e9,), n_frames=1)
 
 
 def beacon(cycle_id=7, attempt=0, **users):
@@ -35,7 +38,7 @@ def data(cycle_id=7, user=4, direction=DOWN, stage=DELIVERED):
 def user():
     """User 4, connected, with timeouts of 2 s for a grant and 8 s after it."""
     way = mobility.Waypoints([(6.0, 0.0, 0.0), (8.0, 0.0, 0.0)], 0.5)
-    made = User({4: way}, step_s=2.0, beacon_s=math.inf)
+    made = User({4: way}, ONE_FRAME, step_s=2.0, beacon_s=math.inf)
     made.handle(PeersChanged(()), 0.0)
     return made
 
@@ -128,13 +131,14 @@ def test_a_connected_user_keeps_its_state(user, state):
 
 
 def test_the_true_position_of_a_cycle_is_that_at_its_reference_time():
-    made = User({4: mobility.Waypoints([(6.0, 0.0, 0.0), (8.0, 0.0, 0.0)], 0.5)}, step_s=2.0,
-                beacon_s=math.inf, reference_s=0.25)
+    scenario = Scenario(frame_duration_s=0.1)
+    made = User({4: mobility.Waypoints([(6.0, 0.0, 0.0), (8.0, 0.0, 0.0)], 0.5)}, scenario,
+                step_s=2.0, beacon_s=math.inf)
     made.handle(PeersChanged(()), 0.0)
     made.ground_truths(9.0)
     answers(made, beacon(), 10.0)
     (truth,) = answers(made, grant(), 10.0)
-    np.testing.assert_allclose(truth.position, [6.0 + 0.5 * (1 + 0.25), 0, 0])
+    np.testing.assert_allclose(truth.position, [6.0 + 0.5 * (1 + reference_s(scenario)), 0, 0])
     np.testing.assert_allclose(truth.velocity, [0.5, 0, 0])
 
 
@@ -142,7 +146,7 @@ def test_the_true_position_of_a_cycle_is_that_at_its_reference_time():
 def users():
     """Users 4 to 6 of one node, connected."""
     made = User({user: mobility.Static((user, 0.0, 0.0)) for user in (4, 5, 6)},
-                step_s=0.5, beacon_s=1.5)
+                ONE_FRAME, step_s=0.5, beacon_s=1.5)
     made.handle(PeersChanged(()), 0.0)
     return made
 
