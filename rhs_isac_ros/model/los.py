@@ -12,7 +12,12 @@ import numpy as np
 from rhs_isac_ros.model.arrays import checked_positions
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.gain_pattern import GainPattern
-from rhs_isac_ros.model.geometry import element_normals, element_positions, subband_frequencies_hz
+from rhs_isac_ros.model.geometry import (
+    element_normals,
+    element_positions,
+    frame_times_s,
+    subband_frequencies_hz,
+)
 from rhs_isac_ros.model.scenario import Scenario
 
 # Minimum distance of the user from a boresight. On the boresight itself, the direction
@@ -91,6 +96,33 @@ def los_and_derivative(
     for axis, term in zip(boresight_axes(scenario), boresight_terms, strict=True):
         derivative[:, axis] += _positions_first(scenario, band, term[0])
     return gain, derivative
+
+
+def frame_gains(scenario: Scenario, states: np.ndarray, by_unknown: np.ndarray,
+                elements: slice | list[int] = slice(None)) -> np.ndarray:
+    """Compute the gains of elements in the frames of a cycle, and their derivatives.
+
+    Takes states of users, float64 [N, 3] [m] or [N, 6] [m, m/s], and their derivatives with
+    respect to U unknowns, [N, 3 or 6, U]. Returns complex128 [N, 1 + U, N_B, N_SB, F, n] for n
+    elements. Without velocities, the gains of all frames are equal, and F is 1.
+    """
+    times_s = (np.zeros((scenario.n_bands, 1)) if states.shape[1] == 3
+               else frame_times_s(scenario))
+    n_elements, n_unknowns = len(np.arange(scenario.n_elements)[elements]), by_unknown.shape[2]
+    found = np.empty((len(states), 1 + n_unknowns, len(times_s), scenario.n_subbands,
+                      times_s.shape[1], n_elements), complex)
+    for (band, frame), time_s in np.ndenumerate(times_s):
+        # The position at the time of the frame, from the state.
+        moved = np.vstack([np.eye(3), time_s * np.eye(3)])[:states.shape[1]]
+        places, of_frame = states @ moved, found[:, :, band, :, frame]
+        if not n_unknowns:
+            of_frame[:, 0] = los_gain(scenario, places, band)[..., elements]
+            continue
+        gain, slope = los_and_derivative(scenario, places, band)
+        of_frame[:, 0] = gain[..., elements]
+        of_frame[:, 1:] = np.einsum(
+            'nxu,nxjm->nujm', np.matmul(moved.T, by_unknown), slope[..., elements])
+    return found
 
 
 def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int], *,

@@ -27,8 +27,7 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import adjoint, blocks
 from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
 from rhs_isac_ros.model.gaussian import energy_limit
-from rhs_isac_ros.model.geometry import jacobian, to_positions
-from rhs_isac_ros.model.los import los_and_derivative, los_gain
+from rhs_isac_ros.model.los import frame_gains
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import radiation_matrix
 from rhs_isac_ros.positioning.dispersed import DispersedLikelihood, LocatedStates
@@ -355,8 +354,17 @@ class Place:
 
     @functools.cached_property
     def gains(self) -> np.ndarray:
-        """Gains of the direct path's elements and derivatives, [4, N_B, N_SB, N_E]; when used."""
-        return self.model.gains_at(self.point)
+        """Those of `frame_gains` by point and velocity, [1 + U, N_B, N_SB, F, N_E]; when used."""
+        likelihood = self.model.likelihood
+        return frame_gains(likelihood.scenario, *likelihood.nuisance.states(
+            self.point[None], self.values[None]))[0]
+
+
+def of_elements(gains: np.ndarray, n_frames: int) -> np.ndarray:
+    """Return gains [..., N_SB, 1 or F, n] of n elements in each measurement, [n, ..., N_SB F]."""
+    by_element = np.moveaxis(gains, -1, 0)
+    whole = np.broadcast_to(by_element, (*by_element.shape[:-1], n_frames))
+    return whole.reshape(*whole.shape[:-2], whole.shape[-2] * n_frames)
 
 
 class FailedSet(Conditional):
@@ -380,16 +388,13 @@ class FailedSet(Conditional):
            turns: bool = True) -> LocatedStates:
         """Return the likelihood at points; see `Conditional.at`."""
         surfaces, scenario = self._surfaces, self._surfaces.likelihood.scenario
-        positions, failed = to_positions(points), [*self.failed]
-        mean, slopes = self._mean_model.mean_and_jacobian(
-            *surfaces.likelihood.nuisance.states(points, values, moves, turns))
-        gains = np.stack([
-            np.repeat(los_gain(scenario, positions, band)[:, :, failed],
-                      scenario.n_frames, axis=1) for band in range(scenario.n_bands)])
-        amplitudes = np.moveaxis(gains, (0, 1, 2, 3), (2, 0, 3, 1)) * self._amplitudes
+        users, by_unknown = surfaces.likelihood.nuisance.states(points, values, moves, turns)
+        mean, slopes = self._mean_model.mean_and_jacobian(users, by_unknown)
+        gains = frame_gains(scenario, users, by_unknown[..., :0], [*self.failed])
+        amplitudes = of_elements(gains[:, 0], scenario.n_frames).swapaxes(0, 1) * self._amplitudes
         whitening = surfaces.whitening(self.failed)
         factors = (whitening.factors if surfaces.intact.elements.is_exact
-                   else surfaces.factors_at(self.failed, positions))
+                   else surfaces.factors_at(self.failed, users[:, :3]))
         return LocatedStates(surfaces.likelihood.nuisance, mean, slopes, amplitudes, [
             (factors, self._offset - factors.log_det, whitening.information)])
 
@@ -413,15 +418,6 @@ class FailureModel:
                 :, prior.velocity.shape[1]:]], axis=1)
         return [Place(self, *each) for each in zip(points, values, columns, strict=True)]
 
-    def gains_at(self, point: np.ndarray) -> np.ndarray:
-        """Compute `Place.gains` at a point [3]."""
-        scenario, gains = self.likelihood.scenario, []
-        for band in range(scenario.n_bands):
-            gain, slope = los_and_derivative(scenario, to_positions(point[None]), band)
-            slope = np.einsum('xq,xjm->qjm', jacobian(point[None])[0], slope[0])
-            gains.append(np.concatenate([gain, slope]))
-        return np.stack(gains, axis=1)
-
     def effects_of(self, elements: slice | list[int], places: Sequence[Place]
                    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the effects of the failure of each of n elements at P places.
@@ -430,11 +426,11 @@ class FailureModel:
         derivative of the mean with respect to the normalised amplitude, [n, P, N_B, N_SB F].
         """
         prior, effects = self.likelihood.nuisance, self.surfaces.effects
-        gains = np.repeat(np.stack([place.gains[..., elements].transpose(3, 0, 1, 2)
-                                    for place in places], axis=1),
-                          self.likelihood.scenario.n_frames, axis=-1)
+        gains = of_elements(np.stack([place.gains[..., elements] for place in places]),
+                            self.likelihood.scenario.n_frames)
         changes = gains * effects.shift[elements][:, None, None]
-        fixed = prior.scaled_patterns * (1 - prior.multipath_share)[:, None, None]
+        fixed = (prior.scaled_patterns * (1 - prior.multipath_share)[:, None, None])[
+            prior.velocity.shape[1]:]
         return np.concatenate(
             [-changes[:, :, :1], changes[:, :, 1:], fixed * changes[:, :, :1]], axis=2
         ), gains[:, :, 0] * effects.amplitude[elements][:, None]

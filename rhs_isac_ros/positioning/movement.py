@@ -4,7 +4,8 @@ Signals of a user who moves otherwise often fit a wrong position. Two alternativ
 declared therefore have an evidence, the likelihood averaged over their unknowns:
 
 * Amplitude and phase of the direct path are Gaussian and independent from frame to frame, as those
-  of a user who crosses several beams of the surface in a cycle. Only the delay is common.
+  of a user who crosses several beams of the surface in a cycle. Only the delay is common. What
+  failed elements do to the direct path is part of this, so the surface counts as intact.
 * If users are declared to be slower, the user walks. One Gauss-Newton step from each mode, with
   the velocity of someone who walks, finds those who move little, and are near a mode.
 
@@ -53,7 +54,13 @@ class MovementTest:
 
     def __init__(self, system: System, likelihood: Likelihood) -> None:
         self._system, self._likelihood, scenario = system, likelihood, system.scenario
-        self._bases, self._shares, self._energies = _frames(system)
+        # Without failures, this is the system itself.
+        self._intact, self._of_frames = system, likelihood
+        if scenario.failed_element_share:
+            self._intact = System(dataclasses.replace(scenario, failed_element_share=0.0),
+                                  system.codebook, system.surface)
+            self._of_frames = Likelihood(self._intact)
+        self._bases, self._shares, self._energies = _frames(self._intact)
         self._walking: Likelihood | None = None
         if scenario.user_speed_std_mps < _WALKING_STD_MPS:
             self._walking = Likelihood(System(
@@ -87,13 +94,15 @@ class MovementTest:
 
     def _unsteady(self, fit: Fit, signals: Signals, aligned: np.ndarray, level: float) -> float:
         """Return the log evidence of independent frames, relative to that of the fit."""
-        likelihood, prior = self._likelihood, self._likelihood.nuisance
-        if likelihood.model is self._system:
+        likelihood, prior = self._of_frames, self._likelihood.nuisance
+        constant = self._likelihood.log_det - likelihood.log_det
+        if likelihood.model is self._intact:
             weights = likelihood.weights_at(np.array([fit.gain]))[0]
-            whitened = likelihood.whitened(aligned[None], signals)[0] * np.exp(-fit.gain) * weights
-            constant = 2 * float(np.log(weights).sum())
+            whitened = likelihood.whitened(aligned[None], likelihood.signals(signals.received))[
+                0] * np.exp(-fit.gain) * weights
+            constant += 2 * float(np.log(weights).sum())
         else:
-            whitened, constant = self._system.whiten(signals.received[0]), 0.0
+            whitened = self._intact.whiten(signals.received[0])
         powers = np.abs(np.einsum('tbnf,bn->tbf', self._bases.conj(), whitened))**2 / level
         excess = np.multiply.outer(self._energies, self._shares)
         values = np.sum(powers * excess / (1 + excess) - np.log1p(excess), axis=(2, 3))
@@ -104,7 +113,7 @@ class MovementTest:
                 np.log(4 * n) / 2 + np.log(prior.gain_unit))
         rest = (fit.residual - np.sum(np.abs(whitened)**2)) / level - fit.residual
         return (log_sum(values) - np.log(values.size) + constant + float(rest)
-                + prior.log_evidence_of_aligned(aligned) - fit.averaged_evidence)
+                + prior.log_evidence_of_aligned(aligned) - fit.log_evidence)
 
     def _walks(self, walking: Likelihood, modes: Modes, conditionals: Sequence[Conditional],
                signals: Signals) -> float:

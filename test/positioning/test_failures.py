@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from walking_users import system_of, users_of
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import blocks
@@ -49,10 +50,10 @@ def model(codebook):
     return FailureModel(Likelihood(System(SCENARIO, codebook)))
 
 
-def with_failures(elements, levels) -> ElementErrors:
-    stuck = np.full(SCENARIO.n_elements, np.nan)
+def with_failures(elements, levels, n_elements=SCENARIO.n_elements) -> ElementErrors:
+    stuck = np.full(n_elements, np.nan)
     stuck[list(elements)] = levels
-    return ElementErrors(np.ones(SCENARIO.n_elements, complex), stuck)
+    return ElementErrors(np.ones(n_elements, complex), stuck)
 
 
 def real(vectors):
@@ -276,6 +277,32 @@ def test_users_who_walk_have_the_failed_elements_of_users_at_rest(codebook, mode
     values = np.zeros((1, len(walking.nuisance)))
     assert (found.same(at_rest).local(POINT[None], values, signals).value
             == known.local(POINT[None], values, signals).value)
+
+
+def test_elements_fail_at_the_place_of_each_frame():
+    """What a failure changes is linear in the elements, also while users walk."""
+    system, rng = system_of(failed_element_share=0.01), np.random.default_rng(2)
+    model = FailureModel(Likelihood(system))
+    prior, intact = model.likelihood.nuisance, dataclasses.replace(
+        system.scenario, failed_element_share=0.0)
+    state = users_of(system.scenario, 1, 1.0, rng)
+    point, values = to_polar(state[:, :3]), np.zeros((1, len(prior)))
+    values[:, :2] = state[:, 3:5]
+    changes, amplitudes = model.effects_of([3, 17], model.places(
+        point, values, model.likelihood.signals(system.sample(state, rng))))
+
+    def mean_and_slopes(failed, *at):
+        return MeasurementModel(intact, system.codebook, with_failures(
+            failed, at, intact.n_elements)).mean_and_jacobian(*prior.states(point, values))
+    before, usual, wider = (mean_and_slopes(*one) for one in (
+        ((), ), ((3, 17), 0.5, 0.5), ((3, 17), 0.5 + 12**-0.5, 0.5)))
+    scale = np.abs(before[0]).max()
+    np.testing.assert_allclose(changes[:, 0, 0].sum(axis=0), (before[0] - usual[0])[0],
+                               atol=1e-12 * scale)
+    np.testing.assert_allclose(changes[:, 0, 1:6].sum(axis=0), (usual[1] - before[1])[0],
+                               atol=1e-12 * np.abs(before[1]).max())
+    for found in (amplitudes[0], model.failed_set((3, 17)).at(point, values).linear[:, 0]):
+        np.testing.assert_allclose(found, wider[0] - usual[0], atol=1e-12 * scale)
 
 
 def test_sets_of_a_small_surface_grow_to_all_elements(random_beams):

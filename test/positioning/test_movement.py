@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from walking_users import inside, system_of, users_of
+from walking_users import WALKING, inside, system_of, users_of
 
 from rhs_isac_ros.positioning import BayesEstimator
+from rhs_isac_ros.positioning.estimate import Fit
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.movement import MovementTest
 
@@ -45,6 +46,21 @@ def test_faster_users_have_no_fix_at_a_wrong_place(declared):
     wrong = np.count_nonzero(fix) * (1 - inside(errors, covariances, 2)) if fix.any() else 0
     assert wrong < 2.5
     assert all('user_speed_std_mps' in one or one.startswith('residual') for one in reasons if one)
+
+
+def test_independent_frames_contain_what_failed_elements_do():
+    """Their evidence is that of an intact surface, and the fit's that of the sets found."""
+    systems = [system_of(failed_element_share=share) for share in (0.0, 0.01)]
+    likelihoods = [Likelihood(one) for one in systems]
+    received = system_of().sample(
+        users_of(WALKING, 1, 1.0, np.random.default_rng(1)), np.random.default_rng(2))
+    of_set, average = -50.0, -70.0
+    fits = [Fit(np.zeros(6), np.eye(6), of_set, evidence, 40.0, 40.0, 0.0, None)
+            for evidence in (of_set, average)]
+    ratios = [MovementTest(system, one)._unsteady(
+        fit, one.signals(received), np.zeros(len(one.nuisance)), 1.0) - one.log_det
+        for system, one, fit in zip(systems, likelihoods, fits, strict=True)]
+    assert ratios[0] == pytest.approx(ratios[1], abs=1e-6)
 
 
 def test_short_frames_need_no_test():
