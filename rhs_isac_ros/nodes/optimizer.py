@@ -23,7 +23,7 @@ from rhs_isac_ros.ros import convert, parameters, topics
 from rhs_isac_ros.ros.endpoints import LATCHED, create_publisher
 from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX, same_value
 from rhs_isac_ros.ros.role_node import RoleNode
-from rhs_isac_ros.ros.run import StartError, parse, run
+from rhs_isac_ros.ros.run import StartError, parse, run, spin
 from rhs_isac_ros.ros.session import Session
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
@@ -31,7 +31,7 @@ from rhs_isac_ros.support.arguments import (
     check_effect,
     input_file,
 )
-from rhs_isac_ros.support.exits import print_error
+from rhs_isac_ros.support.exits import exit_code_of
 
 
 class CodebookParameterService(ParameterService):
@@ -197,22 +197,21 @@ def main(args: Sequence[str] | None = None) -> int:
     check_effect(parser, options, [name for name in vars(options) if name != 'push_file'],
                  not options.push_file, 'no --push-file, which does not optimise')
     check(parser, options)
-    try:
-        if options.push_file:
-            return _push(Codebook.load(options.push_file), args)
-        codebook, reason = run_command(options)
-    except KeyboardInterrupt:
-        return 0
-    except ERRORS as error:
-        print_error(error, topics.OPTIMIZER_NODE)
-        return 2
+    return exit_code_of(
+        lambda: _run(options, args), (*ERRORS, StartError), topics.OPTIMIZER_NODE,
+        failures=(PushError,), interrupted=0)
+
+
+def _run(options: argparse.Namespace, args: Sequence[str]) -> None:
+    if options.push_file:
+        return _push(Codebook.load(options.push_file), args)
+    codebook, reason = run_command(options)
     if options.push:
         return _push(codebook, args)
-    if reason == INTERRUPTED:
-        return 0
-    overrides = ros_parameters({'codebook_file': str(options.output),
-                                'scenario_file': str(options.scenario or '')})
-    return run(lambda: [OptimizerNode(parameter_overrides=overrides)], args)
+    if reason != INTERRUPTED:
+        overrides = ros_parameters({'codebook_file': str(options.output),
+                                    'scenario_file': str(options.scenario or '')})
+        spin(lambda: [OptimizerNode(parameter_overrides=overrides)], args)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -230,14 +229,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _push(codebook: Codebook, args: Sequence[str]) -> int:
-    try:
-        with Session(['', *args]) as session:
-            push(session, codebook)
-    except (PushError, StartError) as error:
-        print_error(error, topics.OPTIMIZER_NODE)
-        return 1 if isinstance(error, PushError) else 2
-    except KeyboardInterrupt:
-        return 0
+def _push(codebook: Codebook, args: Sequence[str]) -> None:
+    with Session(['', *args]) as session:
+        push(session, codebook)
     print(f'codebook {codebook.id} is set')
-    return 0

@@ -37,7 +37,7 @@ from rhs_isac_ros.ros.environment import (
     log_arguments,
     use_discovery_profile,
 )
-from rhs_isac_ros.support.exits import on_end_signals, print_error
+from rhs_isac_ros.support.exits import exit_code_of, on_end_signals
 from rhs_isac_ros.support.fields import ParameterError
 
 # Options that ROS accepts only after --ros-args.
@@ -214,12 +214,9 @@ def spin(make: Callable[[], Sequence[_NodeT]], args: Sequence[str],
 
 def run(make: Callable[[], Sequence[Node]], args: Sequence[str]) -> int:
     """Spin nodes until a signal arrives; return exit code 0, or 2 if they cannot start."""
-    try:
+    def work() -> None:
         spin(make, args)
-    except StartError as error:
-        print_error(error, os.path.basename(args[0]))
-        return 2
-    return 0
+    return exit_code_of(work, (StartError,), os.path.basename(args[0]))
 
 
 def entry(executable: str, make: Callable[[], Sequence[Node]]) -> Callable[..., int]:
