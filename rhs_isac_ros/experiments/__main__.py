@@ -10,9 +10,9 @@ import importlib.util
 import math
 import sys
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from rhs_isac_ros.codebook import OBJECTIVES, CodebookError
 from rhs_isac_ros.experiments import calibrate
@@ -51,8 +51,8 @@ from rhs_isac_ros.support.arguments import (
     picture_file,
     positive_int,
     seed,
+    typed,
 )
-from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.job_commands import add_run_options, run_command
@@ -62,7 +62,6 @@ from rhs_isac_ros.support.texts import markdown_table
 # The bootstrap keeps 2000 weights for each position in memory.
 _MAX_POSITIONS = 10**5
 _MAX_SETTINGS = 10**4
-_Parsed = TypeVar('_Parsed')
 _EPILOG = '\n\n'.join(textwrap.fill(f'{title}: {", ".join(names)}.', 79) for title, names in (
     ('fields', (*FIELDS, CODEBOOK, ESTIMATOR)), ('measures', MEASURES)))
 
@@ -105,14 +104,14 @@ def _sweep(parser: ArgumentParser, options: argparse.Namespace) -> int:
 
 def _add_options(parser: ArgumentParser) -> None:
     add = parser.add_argument
-    add('--vary', type=_type(lambda text: parse_axis(text).distinct()), action='append',
+    add('--vary', type=typed(lambda text: parse_axis(text).distinct()), action='append',
         required=True, metavar='FIELD=VALUE,...',
         help='field and its values, in the syntax of scenario files; the first field is the x '
              'axis of the picture, the second has a line for each value, and the others have '
              'panels')
-    add('--with', type=_type(parse_axis), action=_Along, metavar='FIELD=VALUE,...',
+    add('--with', type=typed(parse_axis), action=_Along, metavar='FIELD=VALUE,...',
         help='field that varies together with the field of the previous --vary')
-    add('--measure', type=_type(parse_measures), default='crlb,mse', metavar='NAME,...',
+    add('--measure', type=typed(parse_measures), default='crlb,mse', metavar='NAME,...',
         help='measures, each in its own panel; NAME+NAME draws several in one panel '
              '(default: %(default)s)')
     add('--scenario', '--config', type=input_file, metavar='FILE',
@@ -209,14 +208,6 @@ class _Along(argparse.Action):
             namespace.vary[-1] = namespace.vary[-1].along(values)
         except ValueError as error:
             parser.error(f'argument {option_string}: {error}')
-
-
-def _type(parse: Callable[[str], _Parsed]) -> Callable[[str], _Parsed]:
-    """Convert a function that raises ValueError for invalid text to a type for argparse."""
-    def parse_argument(text: str) -> _Parsed:
-        with translated(ValueError, argparse.ArgumentTypeError):
-            return parse(text)
-    return parse_argument
 
 
 if __name__ == '__main__':

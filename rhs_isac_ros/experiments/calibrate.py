@@ -25,10 +25,8 @@ from rhs_isac_ros.calibration.survey import PLACE_WAVELENGTHS
 from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.experiments.pilots import Found, PilotWork
 from rhs_isac_ros.model import MultipathEstimate, Scenario
-from rhs_isac_ros.model.board import Board
 from rhs_isac_ros.model.boards import board_of
-from rhs_isac_ros.support.arguments import check_distinct, input_file, output_file
-from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.arguments import check_distinct, input_file, output_file, typed
 from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.files import (
     ArchiveError,
@@ -167,11 +165,6 @@ def _print_errors(found: Found) -> None:
               flush=True)
 
 
-def _board(text: str) -> Board:
-    with translated(ValueError, argparse.ArgumentTypeError):
-        return board_of(parse_yaml(text))
-
-
 def _states(text: str) -> tuple[complex, ...]:
     try:
         states = tuple(complex(word) for word in text.split(','))
@@ -212,7 +205,8 @@ def add_options(parser: argparse.ArgumentParser, sources: str = '') -> None:
     what.add_argument('--states', type=_states, metavar='OFF,ON',
         help='write a surface whose elements have these coefficients for 0 and 1, such as 1,-1 or '
         '0.5+0.1j,-0.6, without an estimation')
-    what.add_argument('--board', type=_board, nargs='*', metavar='BOARD',
+    what.add_argument('--board', type=typed(lambda text: board_of(parse_yaml(text))), nargs='*',
+        metavar='BOARD',
         help='compare the board of the scenario with others by their evidence, such as paper or '
         '"{kind: resonant, quality_factor: 30}", instead of calibrating its elements')
     add('--fit', nargs='+', metavar='FIELD',

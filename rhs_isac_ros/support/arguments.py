@@ -7,12 +7,14 @@ import shlex
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import Field
 from rhs_isac_ros.support.files import check_writable, parse_yaml
 from rhs_isac_ros.support.pictures import picture_format
+
+_Parsed = TypeVar('_Parsed')
 
 
 class ArgumentParser(argparse.ArgumentParser):
@@ -44,6 +46,14 @@ class ArgumentParser(argparse.ArgumentParser):
 class HelpFormatter(
         argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
     """A formatter that shows defaults and keeps line breaks of the description and epilog."""
+
+
+def typed(parse: Callable[[str], _Parsed]) -> Callable[[str], _Parsed]:
+    """Return a type for argparse whose errors are the ValueErrors of a function of the text."""
+    def parse_argument(text: str) -> _Parsed:
+        with translated(ValueError, argparse.ArgumentTypeError):
+            return parse(text)
+    return parse_argument
 
 
 def _number(declared: Field) -> Callable[[str], Any]:

@@ -31,8 +31,7 @@ from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.ros.recording import Recorded, RecordingError, read_networks
-from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float
-from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float, typed
 from rhs_isac_ros.support.texts import text_table
 from rhs_isac_ros.system import System, add_files
 from rhs_isac_ros.tools import command, republish
@@ -277,18 +276,13 @@ def _codebooks(
     return {codebook_id: given or log.codebooks[codebook_id] for codebook_id in used}
 
 
-def _estimator(text: str) -> EstimatorKind:
-    with translated(ValueError, argparse.ArgumentTypeError):
-        return EstimatorKind(text)
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
         prog='replay', description='Feed the received signals of a recording to estimators, and '
         'compare their errors with the errors of the recorded network.')
     add = parser.add_argument
     add('file', type=input_file, help='recording')
-    add('--estimator', action='append', type=_estimator, metavar='NAME',
+    add('--estimator', action='append', type=typed(EstimatorKind), metavar='NAME',
         help=f'{", ".join(ESTIMATORS)}, an installed plug-in or MODULE:NAME; may be repeated '
              '(default: bayes)')
     add('--estimator-options', default='', metavar='TEXT',
