@@ -14,6 +14,7 @@ import faulthandler
 import itertools
 import multiprocessing
 import os
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +22,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import rclpy
+
+try:
+    import rclpy
+except ModuleNotFoundError:
+    sys.exit('cycle: error: needs ROS 2; scripts/benchmark cycle installs it')
 from parts import frame
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node

@@ -5,12 +5,17 @@ one process? Networks with many users are compared with a network of few users.
 """
 
 import os
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import rclpy
+
+try:
+    import rclpy
+except ModuleNotFoundError:
+    sys.exit('users: error: needs ROS 2; scripts/benchmark users installs it')
 from parts import frame
 from system.observer import NetworkObserver
 from system.trial_processes import TrialProcesses

@@ -19,11 +19,13 @@ def test_another_name_is_rejected(tmp_path):
     assert done.stderr.startswith('permissions: not a tool')
 
 
-def test_a_missing_name_is_an_error():
-    done = subprocess.run([sys.executable, '-m', 'rhs_isac_ros.tools'], cwd=ROOT,
+@pytest.mark.parametrize(('arguments', 'code', 'line'), [
+    ([], 1, 'usage: python3 -m rhs_isac_ros.tools COMMAND [ARGUMENT ...]\n'),
+    (['topic'], 2, 'python3 -m rhs_isac_ros.tools: error: no command named topic\n')])
+def test_a_missing_or_unknown_name_is_an_error(arguments, code, line):
+    done = subprocess.run([sys.executable, '-m', 'rhs_isac_ros.tools', *arguments], cwd=ROOT,
                           capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (1, '')
-    assert done.stderr.startswith('usage: python3 -m rhs_isac_ros.tools COMMAND ')
+    assert (done.returncode, done.stdout, done.stderr) == (code, '', line)
 
 
 def test_a_link_in_another_directory_finds_the_package(built_scripts, tmp_path):
