@@ -314,35 +314,40 @@ class _Templates:
         rest = np.maximum(energy[:, None] - explained, n * _MIN_PROBABILITY)
         bound, _ = _best_gain(prior, np.zeros_like(rest), rest, n)
         shot, direction = marked(bound >= bound.max(axis=1, keepdims=True) - GRID.margin)
-        of_shot, energy = Segments.of_keys(shot), energy[shot, None]
-        by_node = filtered[shot, :, :, direction].swapaxes(0, 1)
-        arguments = by_node.take(self._index, axis=2)
-        arguments *= self._scale[:, 0]
+        of_shot, n_bands = Segments.of_keys(shot), filtered.shape[1]
+        # With the P pairs of a shot and a direction last, reductions over ranges are fast.
+        places = np.arange(filtered[0, ..., 0].size)[:, None] * filtered.shape[3]
+        by_node = filtered.ravel().take(places + (shot * filtered[0].size + direction))
+        by_node = by_node.reshape(n_bands, -1, len(shot))
+        arguments = by_node.take(self._index, axis=1)
+        arguments *= self._scale
         # A Bessel function I_0(x) is at most exp(x), and its logarithm is convex. So few places
         # need its value.
         total = arguments.sum(axis=0)
-        highest, gain = _best_gain(prior, total / 2, energy, n)
-        highest += self._offset.T[direction]
+        # Without an unknown gain, the values lack the energy, and are of single precision.
+        value, gain = prior.maximised_over_gain(total / 2, energy[shot], n)
+        offset = self._offset.take(direction, axis=1)
+        highest = value + offset
         if prior.gain_std:
             factor = np.exp(-gain).astype(np.float32)
             arguments, total = arguments * factor, total * factor
-        mean = of_shot.max(total.max(axis=1)) / len(arguments)
-        least = of_shot.max(highest.max(axis=1)) - GRID.margin - len(arguments) * (
-            mean - log_bessel(mean))
-        (chosen,) = (highest >= of_shot.repeat(least)[:, None]).ravel().nonzero()
-        arguments = arguments.reshape(len(arguments), -1).take(chosen, axis=1)
-        pair = chosen // highest.shape[1]
-        shot = shot[pair]
-        logs = highest.take(chosen) + np.sum(log_bessel(arguments) - arguments, axis=0)
+        mean = of_shot.max(total.max(axis=0)) / n_bands
+        largest = np.maximum(of_shot.max(highest.max(axis=0)), np.finfo(np.float32).min)
+        least = largest - GRID.margin - n_bands * (mean - log_bessel(mean))
+        (chosen,) = (highest >= of_shot.repeat(least)).ravel().nonzero()
+        arguments = arguments.reshape(n_bands, -1).take(chosen, axis=1)
+        shot = shot[chosen % len(shot)]
+        logs = value.take(chosen) + offset.take(chosen).astype(float) + np.sum(
+            log_bessel(arguments) - arguments, axis=0)
         if prior.gain_std:
             # Laplace's integral over the gain, which hardly changes the Bessel functions.
-            power = np.exp(-2 * gain.take(chosen)) * energy[pair, 0]
+            power = np.exp(-2 * gain.take(chosen)) * energy[shot]
             logs -= np.log(4 * power - total.take(chosen) + prior.gain_std**-2) / 2 + math.log(
                 prior.gain_unit)
-        largest = np.maximum(Segments.of_keys(shot).max(logs), np.finfo(float).min)
         with np.errstate(divide='ignore'):
             return self._state.offset + largest + np.log(
-                np.bincount(shot, np.exp(logs - largest[shot]), minlength=n_shots))
+                np.bincount(shot, np.exp(logs - largest[shot]), minlength=n_shots)
+            ) - (not prior.gain_std) * energy
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether some position explains the signals up to this residual energy."""
@@ -431,23 +436,26 @@ def log_ratios_of(
             likelihood.whitened(values, select(signals, rows)), values, residuals[rows], prior
         ) - in_sight[rows]
 
-    found = ratios(values)
+    found, log_volume = ratios(values), np.zeros(len(values))
     (near,) = np.nonzero(np.abs(alternative.log_odds + found) < _OFFSETS.near)
-    if len(near):
+    around = np.concatenate([-axes, axes])
+    for _ in range(_OFFSETS.steps):
+        if not len(near):
+            break
         best, at = found[near], values[near]
-        for _ in range(_OFFSETS.steps):
-            low, high = (np.stack([ratios(at + sign * axis, near) for axis in axes], axis=1)
-                         for sign in (-1, 1))
-            curvature = np.maximum(2 * best[:, None] - high - low, _OFFSETS.curvature)
-            step = np.clip((high - low) / (2 * curvature), -_OFFSETS.reach, _OFFSETS.reach)
-            moved = at + step @ axes
-            there = ratios(moved, near)
-            better = there > best
-            best, at = np.where(better, there, best), np.where(better[:, None], moved, at)
-            if (np.abs(step).max(axis=1) < _OFFSETS.close)[
-                    alternative.log_odds + best > -_OFFSETS.sure].all():
-                break
-        found[near], values[near] = best - np.log(curvature).sum(axis=1) / 2, at
+        low, high = np.split(ratios(
+            (at[:, None] + around).reshape(-1, len(prior)), np.repeat(near, len(around))
+        ).reshape(len(near), -1), 2, axis=1)
+        curvature = np.maximum(2 * best[:, None] - high - low, _OFFSETS.curvature)
+        log_volume[near] = -np.log(curvature).sum(axis=1) / 2
+        step = np.clip((high - low) / (2 * curvature), -_OFFSETS.reach, _OFFSETS.reach)
+        moved = at + step @ axes
+        there = ratios(moved, near)
+        better = there > best
+        found[near[better]], values[near[better]] = there[better], moved[better]
+        near = near[(np.abs(step).max(axis=1) >= _OFFSETS.close)
+                    & (alternative.log_odds + found[near] > -_OFFSETS.sure)]
+    found += log_volume
     return found, values, likelihood.whitened(values, signals)
 
 

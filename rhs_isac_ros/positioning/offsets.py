@@ -1,5 +1,6 @@
 """Offsets of carrier and timing, estimated from the signals before the position is known."""
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +41,8 @@ class Alignment:
 
     def __init__(self, likelihood: Likelihood, spread: np.ndarray) -> None:
         self._prior = likelihood.nuisance
+        # Most grids have one part, whose factors are kept.
+        self._factors = functools.lru_cache(maxsize=1)(self._factors_between)
         # Strong signals must not make the sum singular up to rounding errors.
         least = np.maximum(_MIN_SPREAD * np.trace(spread, axis1=1, axis2=2).real, 1.0)
         roots = np.linalg.cholesky(spread + least[:, None, None] * np.eye(spread.shape[1]))
@@ -60,7 +63,7 @@ class Alignment:
         if not self._prior.moves_multipath.any():
             return np.zeros((len(received), len(self._prior)))
         if starts is None:
-            starts = np.stack([self._best_on_grid(one) for one in received])
+            starts = self._best_on_grid(received)
         prior, moves, values = self._prior, self._prior.moves_multipath, starts.copy()
         for _ in range(_SEARCH.refinements):
             divided = prior.divide(received, values)[:, None]
@@ -76,12 +79,34 @@ class Alignment:
         return values
 
     def _best_on_grid(self, received: np.ndarray) -> np.ndarray:
-        """Return the best grid values of parameters whose likelihood has several maxima."""
+        """Return the best grid values, [N, Q], of parameters with several maxima."""
+        prior, candidates = self._prior, self._candidates
+        if not prior.needs_search.any():
+            return np.zeros((len(received), len(prior)))
+        # Measurements with equal factors count together. The energy is a quadratic form.
+        groups = self._groups
+        white = multiply_rows(
+            np.moveaxis(self._whitener[:, :, groups], 2, 1), received[:, :, groups])
+        products = np.matmul(white.conj(), np.swapaxes(white, 2, 3))
+        parts = blocks(len(candidates), max(_SEARCH.block // products[..., 0].size, 1))
+        cost = np.empty((len(received), len(candidates)))
+        for part in parts:
+            factors = self._factors(part.start, part.stop)
+            turned = np.matmul(factors, np.swapaxes(products, 2, 3))
+            cost[:, part] = np.einsum(
+                'bcg,nbcg->nc', factors.view(float), turned.view(float))
+        if prior.gain_std:
+            cost = received[0].size * np.log(cost)
+        cost += candidates**2 @ prior.precision / 2
+        # Half a period of the timing may change nothing; then rounding must not decide.
+        return candidates[np.argmin(np.round(cost, 6), axis=1)]
+
+    @functools.cached_property
+    def _candidates(self) -> np.ndarray:
+        """Parameters on the grid, float64 [C, Q]."""
         prior = self._prior
         (searched,) = np.nonzero(prior.needs_search)
-        if not len(searched):
-            return np.zeros(len(prior))
-        n_grid = _SEARCH.points[min(len(searched), len(_SEARCH.points)) - 1]
+        n_grid = _SEARCH.points[min(max(len(searched), 1), len(_SEARCH.points)) - 1]
         # Beyond half a period, the signals repeat.
         reach = np.minimum(_SEARCH.reach, prior.half_period[searched])
         turns = reach * np.ptp(prior.scaled_patterns[searched].imag, axis=(1, 2))
@@ -91,15 +116,21 @@ class Alignment:
         grid = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1)
         candidates = np.zeros((grid[..., 0].size, len(prior)))
         candidates[:, searched] = grid.reshape(len(candidates), -1)
-        parts = blocks(len(candidates), max(_SEARCH.block // received.size, 1))
-        cost = np.concatenate([np.sum(np.abs(
-            self._whitened(prior.divide(received, candidates[part])))**2, axis=(1, 2))
-            for part in parts])
-        if prior.gain_std:
-            cost = received.size * np.log(cost)
-        cost += candidates**2 @ prior.precision / 2
-        return candidates[np.argmin(cost)]
+        return candidates
 
-    def _whitened(self, signals: np.ndarray) -> np.ndarray:
-        return np.moveaxis(
-            np.matmul(np.moveaxis(signals, 1, 0), np.swapaxes(self._whitener, 1, 2)), 0, 1)
+    @functools.cached_property
+    def _groups(self) -> np.ndarray:
+        """Indices of the measurements of a band for which factors are equal, int [G, S]."""
+        scenario, prior = self._prior.scenario, self._prior
+        shape = scenario.n_subbands, scenario.n_frames
+        patterns = prior.scaled_patterns[prior.needs_search].reshape(-1, *shape)
+        rows = np.arange(np.prod(shape)).reshape(shape)
+        if not np.ptp(patterns, axis=2).any():
+            return rows
+        return rows.ravel()[:, None] if np.ptp(patterns, axis=1).any() else rows.T
+
+    def _factors_between(self, first: int, last: int) -> np.ndarray:
+        """Return factors that candidates remove from `_groups`, complex128 [N_B, C, G]."""
+        patterns = self._prior.scaled_patterns[:, :, self._groups[:, 0]]
+        exponents = np.tensordot(self._candidates[first:last], patterns, 1)
+        return np.ascontiguousarray(np.swapaxes(np.exp(-exponents), 0, 1))

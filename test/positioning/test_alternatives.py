@@ -26,6 +26,7 @@ from rhs_isac_ros.positioning.alternatives import (
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.search import OneState
+from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.system import System
 
 
@@ -128,13 +129,20 @@ def test_the_evidence_is_the_average_over_an_unknown_timing(random_beams):
     ) - prior.log_evidence_of_aligned(np.zeros(len(prior))) + norm().logpdf(values[:, timing])
     expected = logsumexp(exponent) + np.log(8 / 1200)
     best = values[np.argmax(exponent)]
-    for error in (-2.0, 0.0, 2.0):
-        start = (best + error * prior.axes[0])[None]
+    starts, alone = best + np.array([[-2.0], [0.0], [2.0]]) * prior.axes[0], []
+    for start in starts:
         (found,), at, _ = log_ratios_of(
-            outside, likelihood, signals, signals.whitened, start, start, np.zeros(1),
+            outside, likelihood, signals, signals.whitened, start[None], start[None], np.zeros(1),
             np.array([expected]))
         assert found == pytest.approx(0, abs=0.05)
         np.testing.assert_allclose(at, best[None], atol=0.5 * prior.axes[0, timing])
+        alone.append(found)
+    # Shots that take more steps do not affect others.
+    together = select(signals, [0, 0, 0])
+    found, _, _ = log_ratios_of(
+        outside, likelihood, together, together.whitened, starts, starts, np.zeros(3),
+        np.full(3, expected))
+    np.testing.assert_allclose(found, alone, rtol=0, atol=1e-9)
 
 
 @pytest.fixture(scope='module')
