@@ -1,18 +1,13 @@
 """A bound on the mean squared error that includes ambiguities: the error of an informed estimator.
 
-The position is uniform in the region of interest; q = (r, u, v) are its range and direction
-cosines. No estimator has a smaller mean squared error than the posterior mean. An informed
-estimator, which is also given q modulo a lattice, has a smaller error still, because only points
-p_k of a lattice remain for the position p. With the differences d_k = L^-1 (mu(p_k) - mu(p)),
-Lambda = L L^H, and white noise n of unit covariance, the log-likelihood of p_k relative to that of
-p is -d_k^H d_k + 2 Re(d_k^H n). The error of the informed estimator is therefore an average over
-n, which is drawn at random. The Ziv-Zakai bound (Bell, Steinberg, Ephraim and Van Trees, Extended
-Ziv-Zakai lower bound for vector parameter estimation, IEEE Trans. Inf. Theory 43 (2), 1997)
-compares pairs of points, of which the wrong one is likelier with probability Q(sqrt(d^H d / 2));
-here, all points are compared at once.
+The estimator is also given q modulo a lattice, where q = (r, u, v) are range and direction
+cosines, so that only points p_k of a lattice remain for the position p. ``docs/bounds.rst``
+derives the bound from the log-likelihood of p_k relative to that of p,
+-d_k^H d_k + 2 Re(d_k^H n), with the whitened differences d_k of the mean signals and noise n of
+unit covariance, which is drawn at random.
 
-The finer the lattice, the tighter the bound. Steps of up to 2.4 local standard deviations lose
-little, because even such coarse samples of a Gaussian have almost its exact variance.
+Steps of up to 2.4 local standard deviations lose little, because even such coarse samples of a
+Gaussian have almost its exact variance.
 """
 
 from collections.abc import Iterator
