@@ -53,11 +53,10 @@ def test_ambiguity_is_the_pairwise_error_cost_of_the_plain_equations(
 PHASES = {'phase_std_rad': 0.4, 'band_phase_std_rad': 0.8}
 
 
-@pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize(('name', 'phases'), [
     *((name, {}) for name in OBJECTIVES), ('ambiguity', PHASES), ('error', PHASES)])
-def test_gradients_agree_with_finite_differences(name, phases, random_beams, seed):
-    rng = np.random.default_rng(seed)
+def test_gradients_agree_with_finite_differences(name, phases, random_beams):
+    rng = np.random.default_rng(0)
     scenario = Scenario(
         **phases, center_frequencies_hz=(1.8e9, 2.9e9), n_subbands=2, n_frames=2, n_feeds=2,
         elements_per_side=3, max_power_w=0.02, roi_center_m=(3, 0, 0), roi_size_m=(2, 2, 2))

@@ -104,6 +104,7 @@ def test_products_with_many_elements_are_convolutions(rectangle, by_convolution)
     assert_products(rectangle)
 
 
+@pytest.mark.parametrize('rectangle', [(0.0, 0.0), (30.0, -20.0)], indirect=True)
 def test_many_gains_are_drawn_as_plane_waves(rectangle, by_convolution, monkeypatch):
     monkeypatch.setattr(mp, '_WAVE_NODES', 16)
     n, v = 4000, mp.multipath_covariance(rectangle)[1]

@@ -9,10 +9,12 @@ from rhs_isac_ros.positioning.estimate import Fit
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.movement import MovementTest
 
-DECLARED = {'walking': {}, 'slow': dict(user_speed_std_mps=0.1), 'at rest': dict(
-    user_speed_std_mps=0.0), 'at rest among still scatterers': dict(
-    user_speed_std_mps=0.0, max_user_speed_mps=0.01), 'at rest, impaired': dict(
-    user_speed_std_mps=0.0, timing_std_s=1e-7, user_gain_std_db=2.0, element_error_rms=0.05)}
+AT_REST = {'user_speed_std_mps': 0.0}
+DECLARED = {
+    'walking': {}, 'at rest': AT_REST,
+    'at rest among still scatterers': AT_REST | {'max_user_speed_mps': 0.01},
+    'at rest, impaired': AT_REST | {
+        'timing_std_s': 1e-7, 'user_gain_std_db': 2.0, 'element_error_rms': 0.05}}
 
 
 @pytest.fixture(scope='module', params=[

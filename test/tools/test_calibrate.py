@@ -31,7 +31,7 @@ CODEBOOK = Codebook.load(CONFIG / 'codebook_quick.yaml')
 NAMESPACE = '/damaged'
 # Of this seed, four of 36 elements have failed, so that hardly any signals have a fix.
 ERRORS = {'seed': 1, 'element_error_rms': 0.03, 'failed_element_share': 0.05}
-N_PILOTS, N_SERVED = 60, 3
+N_PILOTS, N_SERVED = 40, 3
 TIMEOUT_S = 120.0
 
 
