@@ -74,7 +74,7 @@ def test_a_network_with_the_radio_serves_the_user_without_repetitions(
             'optimizer': {'codebook_file': codebook_file}, 'rhs_controller': {},
             'positioner': {'table_folder': ''}, 'transmission': {},
             # A step is repeated only if a message is lost, also on a busy machine.
-            'bs': {'receiver_noise': False, 'rest_s': 0.0, 'step_timeout_s': 10.0,
+            'bs': {'receiver_noise': False, 'rest_s': 0.1, 'step_timeout_s': 10.0,
                    'retries': 1}}.items():
         bench.add_role(role, values={'scenario_file': file, **values})
     bench.add(example.RadioNode, hardware.measure, hardware.carry, values={'scenario_file': file})
@@ -84,7 +84,7 @@ def test_a_network_with_the_radio_serves_the_user_without_repetitions(
     receiver.create_subscription(ros.Posterior, 'posterior', posteriors.append, EXCHANGE)
     with subprocess.Popen([sys.executable, EXAMPLES / 'user_node.py']) as user:
         try:
-            bench.until(lambda: not list(incomplete(receiver)), 'all endpoints')
+            bench.until(lambda: next(incomplete(receiver), None) is None, 'all endpoints')
 
             def served():
                 """Return cycles that were served with one request, which may be repeated."""
