@@ -45,7 +45,7 @@ def cycle():
     estimator = SimpleNamespace(name='centre', estimate=lambda received: centre)
     roles = {
         'user': user.User(
-            {1: mobility.Static(scenario.roi_center_m)}, step_s=1.0, beacon_s=3.0),
+            {1: mobility.Static(scenario.roi_center_m)}, scenario, step_s=1.0, beacon_s=3.0),
         'channel': Channel(scenario, 0),
         'rhs_controller': RhsController(), 'transmission': Transmission(scenario),
         'positioner': Positioner(scenario, lambda: 0.0),
