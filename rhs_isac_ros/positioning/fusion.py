@@ -173,6 +173,7 @@ class _Rows(NamedTuple):
     covariances: np.ndarray  # Float64 [T, 3, 3].
     curvature: np.ndarray  # Their inverses; 0 for a constant.
     log_peaks: np.ndarray  # Float64 [T].
+    log_limits: np.ndarray  # Largest values in the region, infinite if unknown, float64 [T].
     is_sheet: np.ndarray  # Whether the row is not a constant, bool [T].
 
 
@@ -185,7 +186,8 @@ class _Term(NamedTuple):
     def logarithm(self, positions: np.ndarray) -> np.ndarray:
         """Evaluate the factors at positions [T, S, 3] [m], float64 [T, S]."""
         local, rows = self.pose.to_surface(positions), self.rows
-        values = log_values(local, rows.points, rows.curvature, rows.log_peaks)
+        values = np.minimum(log_values(
+            local, rows.points, rows.curvature, rows.log_peaks), rows.log_limits[:, None])
         # No user behind the surface is in sight.
         return np.where((local[..., 0] <= 0) & rows.is_sheet[:, None], -np.inf, values)
 
@@ -236,16 +238,17 @@ class _Factor(NamedTuple):
         log_share = max(float(np.logaddexp(log_share, min(tail, _LIMITS.tail))),
                         float(np.log(sighting.missing)) + _LIMITS.least)
         log_total = inside.log_mass - np.log1p(-sighting.missing) - log_share
-        log_peaks = sheets.log_peaks - log_total
+        log_peaks, log_limit = sheets.log_peaks - log_total, np.inf
         if heights.max() < _LIMITS.far:
-            # Masses of tails are inaccurate, and must not exceed those of other sheets.
+            # Masses and maxima of tails are inaccurate, and must not exceed those of other sheets.
             log_peaks += log_share - heights.max() - log_peaks.max()
+            log_limit = log_share
         return cls(
             pose, concatenate(
                 _Rows(sheets.means, sheets.covariances, curvature, log_peaks,
-                      np.ones(len(kept), bool)),
+                      np.full(len(kept), log_limit), np.ones(len(kept), bool)),
                 _Rows(sheets.means[:1], np.eye(3)[None], np.zeros((1, 3, 3)),
-                      np.log([sighting.missing]), np.zeros(1, bool))),
+                      np.log([sighting.missing]), np.full(1, np.inf), np.zeros(1, bool))),
             Mixture._make((
                 np.append(inside.log_weights - log_total, np.log(sighting.missing)),
                 np.append(inside.means, centre[None], axis=0),

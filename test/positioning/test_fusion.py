@@ -7,10 +7,11 @@ import pytest
 
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
-from rhs_isac_ros.model.geometry import polar_derivative, to_polar
+from rhs_isac_ros.model.geometry import polar_derivative, to_polar, to_positions
 from rhs_isac_ros.positioning import Sighting, make_estimator
 from rhs_isac_ros.positioning.fusion import Fuser, fuse
 from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.sheets import Sheets
 
 BOUNDS = np.array([[5.0, -5.0, -1.0], [15.0, 5.0, 1.0]])
 EXACT = (0.0, 0.0)
@@ -328,6 +329,21 @@ def test_a_surface_that_sees_the_user_beyond_the_region_of_the_site_is_evidence(
     beyond = PLACE + [0.0, 6.0, 0.0]
     assert outside_probability(-20.0, place=beyond) > 0.99
     assert outside_probability(-20.0, -20.0, place=beyond) > 0.99
+
+
+def test_the_tail_of_a_sheet_far_beyond_the_region_agrees_with_no_surface():
+    # The second surface has a narrow mode four metres beyond the border, at thousands of standard
+    # deviations. Its values in the region are inaccurate.
+    turned = Pose((5.0, -75**0.5, 0.0), (0.0, 0.0, 0.5, 0.75**0.5))
+    seen = [dataclasses.replace(
+        sheets(pose, pose.to_site(to_positions(points))), missing=1e-3,
+        sheets=Sheets(np.zeros(1), points, 1e-6 * np.array([covariance])))
+        for pose, points, covariance in (
+            (Pose(), np.array([[12.8921, -0.3585, 0.0152]]),
+             [[2.53, 3.46, 0.05], [3.46, 144.6, -5.84], [0.05, -5.84, 136.7]]),
+            (turned, np.array([[7.01756, -0.9196, 0.03918]]),
+             [[0.0835, 0.0604, 0.3188], [0.0604, 1.8733, 1.0258], [0.3188, 1.0258, 14.875]]))]
+    assert fuse(seen, BOUNDS).log_agreement < np.log(1e-3) + 0.1
 
 
 def test_users_are_inside_if_no_surface_knows_about_users_outside():
