@@ -21,6 +21,8 @@ intervals are from resampling the users.
 With `--walking`, each ingredient meets the users of config/lab_walk.yaml instead, who walk at
 1 m/s while the surface steps its patterns. Cycles of a track are then 0.6 s apart, carriers are
 off by 1 Hz, and the region is that of the lab.
+
+With `--site`, several surfaces have another arrangement than the right angle of `site`.
 """
 
 import argparse
@@ -50,6 +52,15 @@ from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.system import System
 
 N_CYCLES, SPEED_MPS = 20, 1.0
+# Angles about the vertical axis through the centre of the region [deg], heights [m] and upward
+# tilts [deg] of the surfaces of each site.
+SITES = {
+    'right_angle': ((0.0, 0.0, 0.0), (90.0, 0.0, 0.0)),
+    'sixty': ((0.0, 0.0, 0.0), (60.0, 0.0, 0.0)),
+    'facing': ((0.0, 2.0, 0.0), (180.0, -2.0, 0.0)),
+    'tilted': ((0.0, 0.0, 20.0), (90.0, 0.0, -15.0)),
+    'three': ((0.0, 0.0, 0.0), (100.0, 0.0, 0.0), (220.0, 1.0, 0.0)),
+}
 SHELL_M = (0.5, 5.0)
 # A variance above this counts as a dimension [m^2].
 LEAST_M2 = 1e-8
@@ -60,7 +71,8 @@ class Setting:
     """What a cell simulates, and how it locates users; the defaults are those of no ingredient."""
 
     declared: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # scenario fields
-    surfaces: tuple[str, ...] = ('front',)
+    site: str = 'right_angle'  # of `SITES`
+    has_site: bool = False  # whether there are all surfaces, or only the first one
     pose_error: tuple[float, float] = (0.0, 0.0)  # [m], [deg]; drawn and declared
     size_m: tuple[float, float, float] = (10.0, 10.0, 2.0)  # of the region
     n_cycles: int = 1  # of each user; several are a track
@@ -78,10 +90,19 @@ class Setting:
         return np.array([self.distance_m, 0.0, 0.0]) + np.outer([-0.5, 0.5], self.size_m)
 
     @property
-    def poses(self) -> dict[str, Pose]:
-        """Poses of the surfaces, which face the centre of the region."""
-        return {'front': Pose(), 'side': Pose(
-            (self.distance_m, -self.distance_m, 0.0), (0.0, 0.0, 1.0, 1.0))}
+    def poses(self) -> list[Pose]:
+        """Poses of the surfaces; without height and tilt, they face the centre of the region."""
+        found = []
+        for angle, height_m, tilt in SITES[self.site][:None if self.has_site else 1]:
+            turn, lift = np.radians([angle, tilt]) / 2
+            sine, cosine = np.sin(lift), np.cos(lift)
+            pose = Pose(quaternion=tuple(np.append(
+                sine * np.array([np.sin(turn), -np.cos(turn)]),
+                cosine * np.array([np.sin(turn), np.cos(turn)])).tolist()))
+            origin = np.array([self.distance_m, 0.0, height_m]) - pose.to_site(
+                np.array([self.distance_m, 0.0, 0.0]))
+            found.append(dataclasses.replace(pose, position_m=tuple(np.round(origin, 9).tolist())))
+        return found
 
     @property
     def walks(self) -> bool:
@@ -117,7 +138,7 @@ def declare(others: Ingredient = lambda setting: setting, **fields: Any) -> Ingr
 
 
 INGREDIENTS: dict[str, Ingredient] = {
-    'site': change(surfaces=('front', 'side')),
+    'site': change(has_site=True),
     'track': change(n_cycles=N_CYCLES),
     'prior': change(prior_std_m=0.3),
     'library': change(library=functools.partial(
@@ -149,9 +170,9 @@ REFUSALS = (Refused, CodebookError, ScenarioError)
 class Surface:
     """What is known about one surface in a cell."""
 
-    def __init__(self, setting: Setting, name: str) -> None:
+    def __init__(self, setting: Setting, pose: Pose) -> None:
         base, self.codebook = frame.system(setting.plan)
-        pose = dataclasses.replace(setting.poses[name], uncertainty=setting.pose_error)
+        pose = dataclasses.replace(pose, uncertainty=setting.pose_error)
         corners = np.stack(np.meshgrid(*setting.bounds_m.T), axis=-1).reshape(-1, 3)
         # Rounded, because a region without extent along an axis has none in any frame.
         places = np.round(pose.to_surface(corners), 6)
@@ -320,7 +341,7 @@ class Results(NamedTuple):
 
 def run_cell(setting: Setting, n: int, rng: np.random.Generator) -> Results:
     """Locate users in about n cycles."""
-    surfaces = [Surface(setting, name) for name in setting.surfaces]
+    surfaces = [Surface(setting, pose) for pose in setting.poses]
     locator = SeveralSurfaces if len(surfaces) > 1 else OneSurface
     rows: list[tuple[Estimate, np.ndarray, bool, int]] = []
     for user in range(1, 1 + max(1, n // setting.n_cycles)):
@@ -395,6 +416,7 @@ def main() -> None:
         help='only cells with this ingredient; may be repeated')
     add('--csv', type=output_file, help='CSV file for the table of the documentation')
     add('--walking', action='store_true', help='each ingredient with users who walk in the lab')
+    add('--site', choices=SITES, default=Setting.site, help='arrangement of several surfaces')
     options = parser.parse_args()
     print(f'{options.positions} positions, seed {options.seed}\n')
     results = measure(options)
@@ -414,7 +436,7 @@ def measure(options: argparse.Namespace) -> Cells:
              for one, other in pairs(()) if (one, other) in chosen}
     found = frame.measured(options, 'combinations', measured_cell, {
         name: {'one': one, 'other': other, 'n': options.positions, 'seed': options.seed,
-               'walking': options.walking}
+               'walking': options.walking, 'site': options.site}
         for (one, other), name in cells.items()})
     table = frame.Table(['ingredients'], {
         'fix [%]': ('fix', 1), 'wrong fix [%]': ('wrong_fix', 1),
@@ -431,18 +453,19 @@ def measure(options: argparse.Namespace) -> Cells:
     return results
 
 
-def measured_cell(one: str, other: str, n: int, seed: int, walking: bool) -> dict[str, Any]:
+def measured_cell(one: str, other: str, n: int, seed: int, walking: bool, site: str
+                  ) -> dict[str, Any]:
     """Run a job: return the figures of a cell."""
     # The random numbers of a cell do not depend on the other cells.
     number = [*pairs(())].index((one, other))
-    return cell(one, other, n, streams.generator(seed, streams.HELD_OUT, number), walking) | {
-        'positions': n, 'seed': seed}
+    rng = streams.generator(seed, streams.HELD_OUT, number)
+    return cell(one, other, n, rng, walking, site) | {'positions': n, 'seed': seed}
 
 
-def cell(one: str, other: str, n: int, rng: np.random.Generator, walking: bool = False
-         ) -> dict[str, Any]:
+def cell(one: str, other: str, n: int, rng: np.random.Generator, walking: bool = False,
+         site: str = Setting.site) -> dict[str, Any]:
     """Return the figures of a cell, or why the software refuses it."""
-    setting = Setting()
+    setting = Setting(site=site)
     for name in dict.fromkeys((one, other)):
         setting = INGREDIENTS[name](setting)
     try:

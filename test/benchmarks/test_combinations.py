@@ -8,6 +8,8 @@ import pytest
 from benchmarks import combinations
 from benchmarks.combinations import INGREDIENTS, Setting, cell, change, measure, pairs
 
+from rhs_isac_ros.model import Pose
+
 N = len(INGREDIENTS)
 
 
@@ -55,6 +57,17 @@ def test_walking_users_meet_each_ingredient_alone(rng, monkeypatch):
     np.testing.assert_allclose(setting.bounds_m, [[2, -2, 0], [6, 2, 0]])
 
 
+@pytest.mark.parametrize('site', combinations.SITES)
+def test_surfaces_of_a_site_have_the_region_in_front(site):
+    setting = Setting(site=site, has_site=True)
+    centre = setting.bounds_m.mean(axis=0)
+    for pose, (_, height_m, tilt) in zip(setting.poses, combinations.SITES[site], strict=True):
+        place = pose.to_surface(centre + [0, 0, height_m])
+        np.testing.assert_allclose(place, [10, 0, 0], atol=1e-8)
+        assert pose.rotation[2, 0] == pytest.approx(np.sin(np.radians(tilt)))
+    assert Setting().poses == [Pose()]
+
+
 def test_users_outside_count_only_for_wrong_fixes():
     found = cell('thin', 'outside', 12, np.random.default_rng(3))
     assert found['n'] == 12
@@ -73,10 +86,11 @@ def test_finished_cells_are_kept_until_all_are_measured(monkeypatch, tmp_path, c
     monkeypatch.chdir(tmp_path)
     options = argparse.Namespace(
         positions=5, seed=1, only=['site'], json=tmp_path / 'cells.json', jobs=1, dask=None,
-        walking=False)
+        walking=False, site='three')
     measured = []
 
-    def counted(one, other, n, rng, walking):
+    def counted(one, other, n, rng, walking, site):
+        assert site == 'three'
         measured.append((one, other))
         if len(measured) == 3:
             raise KeyboardInterrupt
