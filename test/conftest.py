@@ -41,11 +41,23 @@ hypothesis.settings.register_profile(
 def pytest_addoption(parser):
     parser.addoption('--thorough', action='store_true',
                      help='test each property on 5000 random examples instead of 75 fixed ones')
+    parser.addoption('--first-cases', action='store_true',
+                     help='run the first case of each test that has several')
 
 
 def pytest_configure(config):
     thorough = config.getoption('thorough')
     hypothesis.settings.load_profile('thorough' if thorough else 'quick')
+
+
+# After the options that select tests.
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config, items):
+    if config.getoption('first_cases'):
+        first: dict[str, pytest.Item] = {}
+        for item in items:
+            first.setdefault(item.nodeid.partition('[')[0], item)
+        items[:] = first.values()
 
 
 def pytest_collection_finish():

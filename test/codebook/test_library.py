@@ -152,6 +152,7 @@ def test_the_command_continues_after_an_interruption_and_on_other_workers(
     pytest.importorskip('joblib')
     monkeypatch.setattr(library, '_N_TRIALS', 1)
     monkeypatch.setattr(library, '_STEPS', 2)
+    monkeypatch.setattr(library, '_N_POSITIONS', 4)
     scenario_file = tmp_path / 'scenario.yaml'
     scenario_file.write_text(
         'center_frequencies_hz: [2.5e+9, 2.6e+9]\nn_subbands: 2\nn_frames: 2\n'
