@@ -80,11 +80,11 @@ class Alignment:
 
     def _best_on_grid(self, received: np.ndarray) -> np.ndarray:
         """Return the best grid values, [N, Q], of parameters with several maxima."""
-        prior, candidates = self._prior, self._candidates
+        prior = self._prior
         if not prior.needs_search.any():
             return np.zeros((len(received), len(prior)))
         # Measurements with equal factors count together. The energy is a quadratic form.
-        groups = self._groups
+        candidates, groups = self._candidates, self._groups
         white = multiply_rows(
             np.moveaxis(self._whitener[:, :, groups], 2, 1), received[:, :, groups])
         products = np.matmul(white.conj(), np.swapaxes(white, 2, 3))
@@ -106,7 +106,7 @@ class Alignment:
         """Parameters on the grid, float64 [C, Q]."""
         prior = self._prior
         (searched,) = np.nonzero(prior.needs_search)
-        n_grid = _SEARCH.points[min(max(len(searched), 1), len(_SEARCH.points)) - 1]
+        n_grid = _SEARCH.points[min(len(searched), len(_SEARCH.points)) - 1]
         # Beyond half a period, the signals repeat.
         reach = np.minimum(_SEARCH.reach, prior.half_period[searched])
         turns = reach * np.ptp(prior.scaled_patterns[searched].imag, axis=(1, 2))

@@ -122,14 +122,19 @@ def test_the_information_is_the_covariance_of_the_gradient(codebook, changes):
 def test_the_signals_alone_reveal_the_offsets_of_carrier_and_timing(codebook):
     scenario = declaring(carrier_offset_std_hz=2e3, timing_std_s=1e-7)
     likelihood = Likelihood(System(scenario, codebook))
-    alignment = Alignment(likelihood, tabulate(likelihood.model)['spread'])
+    spread = tabulate(likelihood.model)['spread']
     rng = np.random.default_rng(5)
     values = rng.normal(size=(20, 2))
     positions = scenario.sample_positions(20, rng)
     received = MeasurementModel(SCENARIO, codebook).sample(positions, rng)
     received = received * nuisance_of(scenario).factors(values * [2e3, 1e-7])
-    found = alignment.values_of_each(received)
+    found = Alignment(likelihood, spread).values_of_each(received)
     assert np.abs(found - values).max() < 0.3
+    # Parameters whose likelihood has one maximum are not searched for on a grid.
+    likelihood.nuisance.needs_search = np.zeros(2, bool)
+    local = Alignment(likelihood, spread)
+    np.testing.assert_array_equal(
+        local.values_of_each(received), local.values_of_each(received, np.zeros((20, 2))))
 
 
 def test_errors_of_elements_have_the_covariance_at_the_position(codebook):
