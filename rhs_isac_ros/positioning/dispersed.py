@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import gammaln, xlog1py, xlogy
 
 from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.arrays import adjoint, mixture_weights, multiply_rows
@@ -165,10 +166,11 @@ def _failure_counts(n_elements: int, share: float) -> tuple[np.ndarray, np.ndarr
     """Return numbers of failures divided by the mean, and the logs of their probabilities."""
     if share == 0:
         return np.zeros(1), np.zeros(1)
-    from scipy.stats import binom
-
     counts = np.arange(n_elements + 1)
-    probability = binom.pmf(counts, n_elements, share)
+    # The distribution of `scipy.stats`, whose import takes a second.
+    probability = np.exp(
+        gammaln(n_elements + 1) - gammaln(counts + 1) - gammaln(n_elements - counts + 1)
+        + xlogy(counts, share) + xlog1py(n_elements - counts, -share))
     likely = counts[probability > _MIN_PROBABILITY]
     if len(likely) > _MAX_COUNTS:
         likely = np.unique(np.linspace(likely[0], likely[-1], _MAX_COUNTS).round().astype(int))

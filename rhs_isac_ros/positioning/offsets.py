@@ -41,8 +41,8 @@ class Alignment:
 
     def __init__(self, likelihood: Likelihood, spread: np.ndarray) -> None:
         self._prior = likelihood.nuisance
-        # Most grids have one part, whose factors are kept.
-        self._factors = functools.lru_cache(maxsize=1)(self._factors_between)
+        # Most grids have one part, whose factors are kept; they can be pickled and copied.
+        self._latest_factors: tuple[slice, np.ndarray] | None = None
         # Strong signals must not make the sum singular up to rounding errors.
         least = np.maximum(_MIN_SPREAD * np.trace(spread, axis1=1, axis2=2).real, 1.0)
         roots = np.linalg.cholesky(spread + least[:, None, None] * np.eye(spread.shape[1]))
@@ -91,7 +91,7 @@ class Alignment:
         parts = blocks(len(candidates), max(_SEARCH.block // products[..., 0].size, 1))
         cost = np.empty((len(received), len(candidates)))
         for part in parts:
-            factors = self._factors(part.start, part.stop)
+            factors = self._factors(part)
             turned = np.matmul(factors, np.swapaxes(products, 2, 3))
             cost[:, part] = np.einsum(
                 'bcg,nbcg->nc', factors.view(float), turned.view(float))
@@ -129,8 +129,12 @@ class Alignment:
             return rows
         return rows.ravel()[:, None] if np.ptp(patterns, axis=1).any() else rows.T
 
-    def _factors_between(self, first: int, last: int) -> np.ndarray:
+    def _factors(self, part: slice) -> np.ndarray:
         """Return factors that candidates remove from `_groups`, complex128 [N_B, C, G]."""
-        patterns = self._prior.scaled_patterns[:, :, self._groups[:, 0]]
-        exponents = np.tensordot(self._candidates[first:last], patterns, 1)
-        return np.ascontiguousarray(np.swapaxes(np.exp(-exponents), 0, 1))
+        latest = self._latest_factors
+        if latest is None or latest[0] != part:
+            patterns = self._prior.scaled_patterns[:, :, self._groups[:, 0]]
+            exponents = np.tensordot(self._candidates[part], patterns, 1)
+            latest = part, np.ascontiguousarray(np.swapaxes(np.exp(-exponents), 0, 1))
+            self._latest_factors = latest
+        return latest[1]

@@ -2,6 +2,9 @@
 
 import itertools
 
+import pytest
+from scipy.stats import qmc
+
 from rhs_isac_ros.support import streams
 
 PURPOSES = {'CHANNEL': 0, 'RECEIVER': 1, 'USER': 2, 'BASE_STATION': 3, 'SAMPLES': 4, 'START': 5,
@@ -27,3 +30,9 @@ def test_equal_keys_give_equal_sequences_and_others_different_ones():
     assert first == again
     for a, b in itertools.combinations(first, 2):
         assert not set(a) & set(b)
+
+
+@pytest.mark.parametrize('n_dimensions', [3, 6])
+def test_unit_points_are_a_sobol_sequence_of_scipy(n_dimensions):
+    expected = qmc.Sobol(n_dimensions, scramble=True, seed=0).random(1024)
+    assert streams.unit_points(n_dimensions).tolist() == expected.tolist()
