@@ -44,8 +44,9 @@ def test_the_installation_page_lists_every_extra():
     'path', [*DOCS.glob('*.rst'), *DOCS.glob('notebooks/*.md')], ids=lambda path: path.stem)
 def test_commands_on_the_pages_exist(path):
     text = path.read_text(encoding='utf-8')
-    for command in re.findall(r'scripts/([a-z.]+[a-z])', text):
-        assert (ROOT / 'scripts' / command).is_file(), command
+    for command, is_folder in re.findall(r'scripts/([a-z.]+[a-z])(?![a-z.])(/?)', text):
+        place = ROOT / 'scripts' / command
+        assert place.is_dir() if is_folder else place.is_file(), command
     for module in re.findall(r'python3? -m (rhs_isac_ros[\w.]*)', text):
         place = ROOT.joinpath(*module.split('.'))
         assert place.with_suffix('.py').is_file() or (place / '__main__.py').is_file(), module
