@@ -362,7 +362,7 @@ def separate(shots: np.ndarray, points: np.ndarray, radii: np.ndarray,
     `shots`, int [M], are in ascending order. The `points` (r [m], u, v), float64 [M, 3], of each
     shot begin with the best one; they may have further coordinates. An ellipsoid with the `radii`
     [3] around a mode contains no other mode. Given the curvature [M, 3, 3] of the log-likelihood,
-    broad modes extend further.
+    broad modes extend further, but not in the further coordinates.
     """
     chosen = np.ones(len(points), bool)
     if len(points) < 2:
@@ -370,9 +370,10 @@ def separate(shots: np.ndarray, points: np.ndarray, radii: np.ndarray,
     better, worse, squares = _near(
         shots, points / radii, 1.0 if curvature is None else _LIMITS.reach)
     if curvature is not None:
-        offset, close = (points[worse] - points[better])[:, :3], squares < 1
-        close |= 2 * likelihood_loss(
-            offset, curvature.take(worse, axis=0)) < _LIMITS.same_mode
+        offset, close = points[worse] - points[better], squares < 1
+        close |= (2 * likelihood_loss(
+            offset[:, :3], curvature.take(worse, axis=0)) < _LIMITS.same_mode) & (
+                np.sum((offset / radii)[:, 3:]**2, axis=1) < 1)
         worse, better = worse[close], better[close]
     previous = chosen if not len(worse) else ~chosen
     # A point depends only on better points, so each round settles at least one more. A few rounds

@@ -41,7 +41,7 @@ class _Limits(NamedTuple):
     coarse_bins: float = 0.75
     # Phases by which neighbouring hypotheses of a rate differ [rad]: of the range at the ends of
     # the frames of a band, and of u and v at the edge of the aperture at the ends of the cycle.
-    rate: tuple[float, float] = (1.1, 1.7)
+    rate: tuple[float, float] = (1.1, 0.85)
     # Largest value of `Resolution.direction`. It applies to apertures below one wavelength, where
     # the gains of elements and of the user also change with the direction.
     direction: float = 0.4

@@ -182,6 +182,11 @@ class Likelihood(Conditional):
         others = values * ~self.nuisance.moves_multipath
         return still * np.exp(-(others @ self.nuisance.scaled_patterns[:, :, 0]))[..., None]
 
+    def rates(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the rates of (r, u, v) in `Resolution.rate_steps`; see `NuisancePrior.rates`."""
+        rates = self.nuisance.rates(values, points)
+        return rates / self.resolution.rate_steps[:rates.shape[1]]
+
     def weights_at(self, gains: np.ndarray) -> np.ndarray:
         """Return the factors of whitened measurements, [M, N_B, N_SB F]; without a gain, 1.
 

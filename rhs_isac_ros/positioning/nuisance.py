@@ -191,6 +191,16 @@ class NuisancePrior(Exponents):
         is_unclear = np.minimum(of_speed, of_offset) * band_s**2 > 1 / 16
         return velocities + (is_unclear * change_hz / of_speed)[:, None] * along
 
+    def rates(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the rates of (r [m], u, v) at points for parameters [M, Q], [M, 3] [1/s].
+
+        Without velocities, the result is [M, 0].
+        """
+        n_moving = self.velocity.shape[1]
+        velocities = values[:, :n_moving] @ self.velocity.T
+        return np.matmul(polar_derivative(points)[:, :3 * (n_moving > 0)],
+                         velocities[..., None])[..., 0]
+
     def carried(self, values: np.ndarray, points: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Return parameters [M, Q] at target points for those at points, with equal polar rates.
 
@@ -199,9 +209,8 @@ class NuisancePrior(Exponents):
         n_moving = self.velocity.shape[1]
         if not n_moving:
             return values
-        velocities = values[:, :n_moving] @ self.velocity.T
-        rates = np.matmul(polar_derivative(points), velocities[..., None])
-        velocities = np.matmul(jacobian(target), rates)[..., 0]
+        rates = self.rates(values, points)
+        velocities = np.matmul(jacobian(target), rates[..., None])[..., 0]
         return np.hstack([
             velocities @ np.linalg.pinv(self.velocity).T, values[:, n_moving:]])
 

@@ -181,7 +181,9 @@ def draw_broad_samples(
             levels = ndtri(evenly_spread(len(normal)))
             velocities[rows] = prior.velocities(
                 values, points, np.tile(levels, len(rows))).reshape(len(rows), -1, 3)
-        evidence += _log_share(points.reshape(len(rows), -1, 3), select(modes, rows)).ravel()
+        of_state = select(modes, rows)
+        evidence += log_share(points.reshape(len(rows), -1, 3), of_state, likelihood.rates(
+            of_state.values, of_state.points)).ravel()
         if phases.is_informative:
             likely = evidence >= evidence.max() - _SAMPLING.margin
             outputs = likelihood.at(
@@ -197,10 +199,11 @@ def draw_broad_samples(
     return np.concatenate([positions, velocities], axis=2), log_weights
 
 
-def _log_share(points: np.ndarray, modes: Modes) -> np.ndarray:
+def log_share(points: np.ndarray, modes: Modes, rates: np.ndarray) -> np.ndarray:
     """Return the logarithm of the share of points [M, S, 3] in their own mode, float64 [M, S].
 
     Modes overlap. The shares of all modes in a point add up to 1, so that nothing counts twice.
+    Modes whose `rates` in steps, [M, 3] or [M, 0], differ by at least 1 do not overlap.
     """
     # Expanded about a common centre, squared distances are matrix products, which are faster.
     n_modes, n_samples, _ = points.shape
@@ -211,8 +214,11 @@ def _log_share(points: np.ndarray, modes: Modes) -> np.ndarray:
                @ modes.curvature.reshape(-1, 9).T)
     squares += np.einsum('ma,ma->m', means, spread) - 2 * offsets @ spread.T
     exponent = -squares / (2 * _SAMPLING.spread**2) + np.linalg.slogdet(modes.curvature)[1] / 2
-    own = exponent.reshape(n_modes, n_samples, n_modes)[np.arange(n_modes), :, np.arange(n_modes)]
-    return own - np.logaddexp.reduce(exponent, axis=1).reshape(n_modes, n_samples)
+    is_apart = np.sum((rates[:, None] - rates)**2, axis=2) >= 1
+    exponent = np.where(
+        is_apart[:, None], -np.inf, exponent.reshape(n_modes, n_samples, n_modes))
+    own = exponent[np.arange(n_modes), :, np.arange(n_modes)]
+    return own - np.logaddexp.reduce(exponent, axis=2)
 
 
 class BandPhases:

@@ -13,7 +13,7 @@ import numpy as np
 from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.arrays import blocks, log_sum
 from rhs_isac_ros.model.gaussian import Marginal, likelihood_loss, marginalise, step_to_maximum
-from rhs_isac_ros.model.geometry import polar_derivative, to_polar, to_positions
+from rhs_isac_ros.model.geometry import to_polar, to_positions
 from rhs_isac_ros.positioning.dispersed import (
     ONE_STATE,
     DispersedLikelihood,
@@ -433,12 +433,10 @@ def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float
     best = np.minimum(of_shot.first(modes.log_likelihood[order]), of_shot.max(known))
     relative = value[order] - of_shot.repeat(best)
     order = order[heaviest(of_shot, np.minimum(relative, 0.0), margin)]
-    prior, resolution = likelihood.nuisance, likelihood.resolution
-    points, radii = modes.points[order], resolution.separation(prior.is_coarse)
-    if n_moving := prior.velocity.shape[1]:
-        velocities = modes.values[order, :n_moving] @ prior.velocity.T
-        rates = np.matmul(polar_derivative(points), velocities[..., None])[..., 0]
-        points, radii = np.hstack([points, rates]), np.append(radii, resolution.rate_steps)
+    points = modes.points[order]
+    rates = likelihood.rates(modes.values[order], points)
+    points, radii = np.hstack([points, rates]), np.append(
+        likelihood.resolution.separation(likelihood.nuisance.is_coarse), np.ones(rates.shape[1]))
     order = order[separate(modes.shots[order], points, radii, modes.curvature[order])]
     kept = np.concatenate([rest, order])
     return kept[np.argsort(modes.shots[kept], kind='stable')] if len(rest) else order

@@ -21,7 +21,7 @@ from rhs_isac_ros.model.gaussian import likelihood_loss, marginalise
 from rhs_isac_ros.model.geometry import to_polar
 from rhs_isac_ros.positioning import BayesEstimator
 from rhs_isac_ros.positioning.grid import Starts
-from rhs_isac_ros.positioning.posterior import _log_share
+from rhs_isac_ros.positioning.posterior import log_share
 from rhs_isac_ros.positioning.search import ascend, marginal_at
 from rhs_isac_ros.positioning.segments import concatenate
 from rhs_isac_ros.positioning.sheets import Inside
@@ -115,7 +115,8 @@ def exact_mean(estimator: BayesEstimator, received: np.ndarray, state: np.ndarra
         modes.points, modes.gradient / WIDENING, modes.curvature / WIDENING,
         likelihood.resolution.bounds_m).sample(normal)
     points = to_polar(positions).reshape(-1, 3)
-    log_weights += _log_share(points.reshape(positions.shape), modes)
+    log_weights += log_share(
+        points.reshape(positions.shape), modes, likelihood.rates(modes.values, modes.points))
     centres, values = (np.repeat(one, SAMPLES, axis=0) for one in (modes.points, modes.values))
     values = prior.carried(values, centres, points)
     for _ in range(2):

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import chdtri
 from walking_users import inside, system_of, users_of
 
 from rhs_isac_ros.codebook import Codebook
@@ -75,6 +76,17 @@ def test_positions_and_velocities_are_in_their_regions(walking):
     assert inside(errors[:, :2], joint[:, :2, :2], 2) >= 0.85
     assert inside(errors, joint, 4) >= 0.85
     assert np.sqrt(np.mean(errors[:, 2:]**2)) < 0.3
+
+
+def test_the_sign_of_the_speed_across_the_line_of_sight_is_found(walking):
+    """Two speeds of opposite signs have equal changes of the range; their modes share a place."""
+    system, estimator = walking
+    state = np.array([[2.8294, -0.0726, 0.0, -0.2773, 0.9608, 0.0]] * 24)
+    found = estimator.estimate(system.sample(state, np.random.default_rng(6)))
+    errors = (found.velocity - state[:, 3:])[:, :2]
+    squares = np.einsum('ni,nij,nj->n', errors, np.linalg.inv(
+        found.velocity_covariance[:, :2, :2]), errors)
+    assert np.count_nonzero(squares > chdtri(2, 1e-3)) <= 2
 
 
 @pytest.mark.parametrize('size', [3, 6], ids=['positions', 'velocities'])

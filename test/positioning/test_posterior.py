@@ -16,7 +16,7 @@ from rhs_isac_ros.positioning.posterior import (
     BandPhases,
     Samples,
     _log_density,
-    _log_share,
+    log_share,
 )
 from rhs_isac_ros.positioning.search import Modes
 from rhs_isac_ros.system import System
@@ -77,8 +77,10 @@ def test_the_shares_of_overlapping_modes_follow_their_densities():
     density = np.stack([multivariate_normal(mean, widening * np.linalg.inv(one)).pdf(points)
                         for mean, one in zip(means, curvature, strict=True)])
     np.testing.assert_allclose(
-        np.exp(_log_share(points, modes)), np.einsum('mms->ms', density) / density.sum(axis=0),
-        rtol=1e-9)
+        np.exp(log_share(points, modes, np.zeros((n, 0)))),
+        np.einsum('mms->ms', density) / density.sum(axis=0), rtol=1e-9)
+    # Modes with other velocities have points of their own.
+    assert not log_share(points, modes, np.tile(2.0 * np.arange(n)[:, None], 3)).any()
 
 
 @pytest.mark.slow
