@@ -37,7 +37,7 @@ from rhs_isac_ros.support.files import (
     read_arrays,
     read_matlab,
     write_archive,
-    write_whole,
+    write_arrays,
 )
 
 _FORMAT = 1
@@ -377,7 +377,7 @@ class PathChannel(ArrayFile):
         arrays: dict[str, Any] = {
             name: np.asarray(array, _FILE_TYPES.get(name)) for name in _TYPES
             if (array := getattr(self, name)) is not None}
-        write_whole(path, lambda stream: np.savez_compressed(stream, **arrays))
+        write_arrays(path, arrays, np.savez_compressed)
 
     @classmethod
     def load(cls, path: str | Path) -> 'PathChannel':

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import io
 import json
 import math
 import os
@@ -219,8 +220,17 @@ def parse_yaml(text: str) -> Any:
 def write_archive(path: str | Path, arrays: Mapping[str, np.ndarray | float],
                   about: Mapping[str, Any]) -> None:
     """Write arrays and a JSON-compatible description to a file of NumPy's format ``.npz``."""
-    content: dict[str, Any] = {**arrays, 'about': json.dumps(about)}
-    write_whole(path, lambda stream: np.savez(stream, **content))
+    write_arrays(path, {**arrays, 'about': json.dumps(about)})
+
+
+def write_arrays(path: str | Path, arrays: Mapping[str, Any],
+                 save: Callable[..., None] = np.savez) -> None:
+    """Write arrays to a file of NumPy's format ``.npz``; `save` may also compress them."""
+    # If the disk is full, NumPy before 2 leaves an archive open, which later reports a second
+    # error. In memory, there is always space.
+    archive = io.BytesIO()
+    save(archive, **arrays)
+    write_whole(path, archive.getvalue())
 
 
 def read_arrays(path: str | Path, names: set[str] | None = None) -> dict[str, np.ndarray]:
