@@ -197,9 +197,10 @@ class NuisancePrior(Exponents):
         Without velocities, the result is [M, 0].
         """
         n_moving = self.velocity.shape[1]
+        if not n_moving:
+            return np.zeros((len(points), 0))
         velocities = values[:, :n_moving] @ self.velocity.T
-        return np.matmul(polar_derivative(points)[:, :3 * (n_moving > 0)],
-                         velocities[..., None])[..., 0]
+        return np.matmul(polar_derivative(points), velocities[..., None])[..., 0]
 
     def carried(self, values: np.ndarray, points: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Return parameters [M, Q] at target points for those at points, with equal polar rates.
