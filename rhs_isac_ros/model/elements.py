@@ -52,7 +52,8 @@ _N_NODES = 128
 _BLOCK = 32
 
 # Function of a band and positions, float64 [N, 3] [m]. It returns matrices E, complex128
-# [N, N_SB F, R]; the errors of the direct-path signals are E z, with R white numbers z.
+# [N, N_SB F, R]; the errors of the direct-path signals are E z, with R white numbers z. Objects
+# that keep it are pickled, so it is a function of a module with arguments.
 DirectErrors = Callable[[int, np.ndarray], np.ndarray]
 
 
@@ -147,16 +148,20 @@ class DeclaredElements(SurfaceModel):
         """Return the errors of multipath and direct path; see `SurfaceModel.errors`."""
         # [N_B, N_SB F, T, N_E]
         radiation = np.moveaxis(error_radiation(scenario, beams), 0, 2)
-        n_bands, n_rows, n_terms, n_elements = radiation.shape
+        n_bands, n_rows = radiation.shape[:2]
         amplitude = np.sqrt(spatial_covariance(scenario).power)
         flat = (radiation * amplitude[:, None, None]).reshape(n_bands, n_rows, -1)
-        by_subband = radiation.reshape(n_bands, scenario.n_subbands, -1, n_elements)
+        return (measurement_correlation(scenario) * np.matmul(flat, adjoint(flat)),
+                functools.partial(_declared_errors, scenario, radiation))
 
-        def direct(band: int, positions: np.ndarray) -> np.ndarray:
-            errors = by_subband[band] * los_gain(scenario, positions, band)[:, :, None]
-            return errors.reshape(len(positions), n_rows, n_terms * n_elements)
 
-        return measurement_correlation(scenario) * np.matmul(flat, adjoint(flat)), direct
+def _declared_errors(scenario: Scenario, radiation: np.ndarray, band: int, positions: np.ndarray
+                     ) -> np.ndarray:
+    """Compute `DirectErrors` from the radiation of T terms, [N_B, N_SB F, T, N_E]."""
+    n_rows, n_terms, n_elements = radiation.shape[1:]
+    by_subband = radiation[band].reshape(scenario.n_subbands, -1, n_elements)
+    errors = by_subband * los_gain(scenario, positions, band)[:, :, None]
+    return errors.reshape(len(positions), n_rows, n_terms * n_elements)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -223,16 +228,22 @@ class SurfaceEstimate(SurfaceModel):
     def errors(self, scenario: Scenario, beams: Beamforming) -> tuple[np.ndarray, DirectErrors]:
         """Return the errors of multipath and direct path; see `SurfaceModel.errors`."""
         radiation = element_radiation(scenario, beams)
-        of_elements, of_bands = np.split(self.factor, [2 * scenario.n_elements])
+        of_elements = self.factor[:2 * scenario.n_elements]
         scattered = scattered_errors(scenario, radiation, of_elements @ np.conj(of_elements.T))
+        return (scattered * np.abs(self.band_gains[:, None, None])**2,
+                functools.partial(self._direct_errors, scenario, radiation))
 
-        def direct(band: int, positions: np.ndarray) -> np.ndarray:
-            design = direct_design(scenario, radiation, band, positions)
-            mean = design @ np.concatenate([self.gains, self.offsets])
-            return self.band_gains[band] * (
-                design @ of_elements + mean[..., None] * of_bands[band])
+    def _direct_errors(self, scenario: Scenario, radiation: np.ndarray, band: int,
+                       positions: np.ndarray) -> np.ndarray:
+        of_elements, of_bands = np.split(self.factor, [2 * scenario.n_elements])
+        design = direct_design(scenario, radiation, band, positions)
+        mean = design @ np.concatenate([self.gains, self.offsets])
+        return self.band_gains[band] * (design @ of_elements + mean[..., None] * of_bands[band])
 
-        return scattered * np.abs(self.band_gains[:, None, None])**2, direct
+
+def no_direct_errors(n_rows: int, band: int, positions: np.ndarray) -> np.ndarray:
+    """Return `DirectErrors` of exact elements, for N_SB F rows, zeros [1, N_SB F, 1]."""
+    return np.zeros((1, n_rows, 1))
 
 
 def with_direct_errors(

@@ -36,6 +36,7 @@ from rhs_isac_ros.model.elements import (
     ElementErrors,
     SurfaceEstimate,
     SurfaceModel,
+    no_direct_errors,
     with_direct_errors,
 )
 from rhs_isac_ros.model.gaussian import covariance_root
@@ -260,7 +261,7 @@ class MeasurementModel:
         """The part of `covariance_at` that is the same everywhere, and errors of the rest."""
         covariance = signal_covariance(self.scenario, self.radiation)
         if self.elements.is_exact:
-            return covariance, lambda band, positions: np.zeros((1, self.shape[1], 1))
+            return covariance, functools.partial(no_direct_errors, self.shape[1])
         scattered, direct = self.elements.errors(self.scenario, self.beams)
         return covariance + scattered, direct
 

@@ -43,6 +43,7 @@ from rhs_isac_ros.positioning.likelihood import (
 from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.search import Modes, OneState, Refinement, ascend, predict
 from rhs_isac_ros.positioning.segments import concatenate, select
+from rhs_isac_ros.support.recent import Recent
 
 # Largest expected number of failures for which sets are searched.
 _MAX_EXPECTED = 2.0
@@ -277,8 +278,8 @@ class Whitening(NamedTuple):
 class FailedSurfaces:
     """Moments of the signals for sets of failed elements.
 
-    `surface` and `whitening` are cached functions of a set. Failures have the share that the
-    scenario of the likelihood declares.
+    `surface` and `whitening` are functions of a set that keep their recent values. Failures have
+    the share that the scenario of the likelihood declares.
     """
 
     def __init__(self, likelihood: Likelihood) -> None:
@@ -289,16 +290,17 @@ class FailedSurfaces:
         # Covariance of the errors that all failures together cause on average.
         failing = dataclasses.replace(scenario, element_error_rms=0.0)
         self._error = DeclaredElements(failing).error_covariance(failing, codebook)
-        self._extensions: dict[tuple[Failed, float], list[Whitening]] = {}
         self._n_bytes = self.intact.covariance().nbytes
         #: Blocks of the elements.
         self.parts = blocks(scenario.n_elements, max(_BLOCK_BYTES // self._n_bytes, 1))
         # The same set is often probable in successive shots.
         self.n_kept = min(max(_SURFACE_BYTES // self._n_bytes, 1), _MAX_SURFACES)
-        cache = functools.lru_cache(maxsize=self.n_kept)
-        self.surface = cache(self._surface)
-        self.whitening = cache(lambda failed: Whitening.of(
-            self.surface(failed).covariance[None], likelihood.nuisance))
+        self.surface = Recent(self._surface, self.n_kept)
+        self.whitening = Recent(self._whitening, self.n_kept)
+        # Extensions of the intact surface serve all shots. Others often serve successive ones.
+        n_extended = _EXTENSION_BYTES // (self._n_bytes * scenario.n_elements)
+        self._of_intact = Recent(self._extensions, 2)
+        self._of_failed = Recent(self._extensions, max(n_extended, 1))
 
     def _surface(self, failed: Failed) -> FailedSurface:
         if failed:
@@ -306,27 +308,23 @@ class FailedSurfaces:
         return FailedSurface(np.matmul(self.intact.radiation, self.effects.spatial),
                        self.intact.covariance())
 
+    def _whitening(self, failed: Failed) -> Whitening:
+        return Whitening.of(self.surface(failed).covariance[None], self.likelihood.nuisance)
+
     def extensions(self, failed: Failed, remainder: float) -> list[Whitening]:
         """Return the factors for a set with each element of each block added in turn.
 
         `remainder` times the covariance of the errors of all failures is added to the covariance
         of each extended set.
         """
-        # Another thread may replace this dictionary at any time, but none changes it in place.
-        known = self._extensions
-        found = known.get((failed, remainder))
-        if found is None:
-            surface, parent = self.surface(failed), self.whitening(failed)
-            covariance = surface.covariance + remainder * self._error
-            found = [Whitening.of(covariance + self.effects.growth(surface, part),
-                                  self.likelihood.nuisance, parent) for part in self.parts]
-            # Extensions of the intact surface serve all shots. Others often serve successive ones.
-            n_kept = _EXTENSION_BYTES // (self._n_bytes * self.likelihood.scenario.n_elements)
-            others = [key for key in known if key[0]]
-            left_out = others[:max(len(others) + 1 - n_kept, 0)]
-            self._extensions = {key: known[key] for key in known if key not in left_out} | {
-                (failed, remainder): found}
-        return found
+        return (self._of_failed if failed else self._of_intact)((failed, remainder))
+
+    def _extensions(self, key: tuple[Failed, float]) -> list[Whitening]:
+        failed, remainder = key
+        surface, parent = self.surface(failed), self.whitening(failed)
+        covariance = surface.covariance + remainder * self._error
+        return [Whitening.of(covariance + self.effects.growth(surface, part),
+                             self.likelihood.nuisance, parent) for part in self.parts]
 
     @property
     def log_odds(self) -> float:
@@ -404,8 +402,8 @@ class FailureModel:
 
     def __init__(self, likelihood: Likelihood) -> None:
         self.likelihood, self.surfaces = likelihood, FailedSurfaces(likelihood)
-        self.failed_set = functools.lru_cache(maxsize=self.surfaces.n_kept)(
-            lambda failed: FailedSet(self.surfaces, failed))
+        self.failed_set = Recent(
+            functools.partial(FailedSet, self.surfaces), self.surfaces.n_kept)
 
     def places(self, points: np.ndarray, values: np.ndarray, signals: Signals) -> list[Place]:
         """Return places at points [P, 3] with parameters [P, Q], for the signals of one shot."""

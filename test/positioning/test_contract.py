@@ -1,6 +1,8 @@
 """What every estimator does, whatever its method."""
 
+import copy
 import dataclasses
+import pickle
 
 import numpy as np
 import pytest
@@ -95,3 +97,19 @@ def test_a_codebook_of_other_sizes_is_an_error(codebook, options, name):
     larger = dataclasses.replace(SCENARIO, n_frames=SCENARIO.n_frames + 1)
     with pytest.raises(CodebookError, match='analog: shape'):
         make_estimator(name, larger, codebook, **options.get(name, {}))
+
+
+@pytest.mark.parametrize('declared', [
+    {}, {'element_error_rms': 0.05}, {'failed_element_share': 0.03}, {'timing_std_s': 2e-8},
+    {'user_speed_std_mps': 1.0, 'frame_duration_s': 5e-3}], ids=lambda one: '-'.join(one))
+def test_a_copy_of_what_is_in_use_gives_the_same_results(codebook, declared):
+    """Programs send estimators and systems to other processes, also after their first use."""
+    system = System(dataclasses.replace(SCENARIO, **declared), codebook)
+    places, received = system.pairs(2, 1)
+    estimator = make_estimator('bayes', system.scenario, codebook)
+    expected = estimator.estimate(received).mean
+    bound, covariance = system.crlb(places), system.covariance_at(places)
+    for copied in copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one)):
+        np.testing.assert_array_equal(copied(estimator).estimate(received).mean, expected)
+        np.testing.assert_array_equal(copied(system).crlb(places), bound)
+        np.testing.assert_array_equal(copied(system).covariance_at(places), covariance)
