@@ -69,7 +69,7 @@ class PilotWork:
     def __init__(self, workers: Workers, scenario: Scenario, pilots: Sequence[Pilots]) -> None:
         assert workers.folder
         workers.folder.mkdir(parents=True, exist_ok=True)
-        file = (workers.folder / 'pilots.npz').resolve()
+        workers.files.add(file := (workers.folder / 'pilots.npz').resolve())
         arrays = {f'{name}_{number}': getattr(group, name)
                   for number, group in enumerate(pilots) for name in _FIELDS}
         beams = [group.beams for group in pilots]

@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import re
-import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -33,18 +32,25 @@ def unfinished(output: Path, options: argparse.Namespace, quiet: bool = False
                ) -> Iterator[Workers]:
     """Yield workers whose results are kept in OUTPUT.jobs until the block succeeds.
 
-    A new folder is also removed if there is nothing to continue: an input is refused, or no job is
-    done. The options are those of `add_run_options`.
+    Those in a new folder are also removed if there is nothing to continue: an input is refused, or
+    no job is done. Results of other runs remain, because these may still need them. The options
+    are those of `add_run_options`.
     """
     folder = output.with_name(output.name + '.jobs')
-    is_new = not folder.exists()
+    is_new, is_over = not folder.exists(), False
+    workers = Workers(options.jobs, options.dask, folder, quiet=quiet)
     try:
-        yield Workers(options.jobs, options.dask, folder, quiet=quiet)
+        yield workers
+        is_over = True
     except BaseException as error:
-        if is_new and (isinstance(error, ValueError) or not any(folder.glob('*.json'))):
-            shutil.rmtree(folder, ignore_errors=True)
+        is_over = is_new and (isinstance(error, ValueError) or not any(folder.glob('*.json')))
         raise
-    shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        for file in workers.files if is_over else ():
+            file.unlink(missing_ok=True)
+        # It contains results of other runs, or does not exist.
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 def _address(text: str) -> str:

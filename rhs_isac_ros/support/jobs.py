@@ -228,6 +228,8 @@ class Workers:
     folder: Path | None = None  #: Folder of a file for each result; None to keep no results.
     label: str = ''  #: Text beside the progress.
     quiet: bool = False  #: Whether to show no progress.
+    #: Files of the jobs so far in `folder`.
+    files: set[Path] = dataclasses.field(default_factory=set, compare=False)
 
     def __post_init__(self) -> None:
         """Raise ValueError if there are no processes."""
@@ -245,7 +247,7 @@ class Workers:
         with contextlib.ExitStack() as stack:
             show = stack.enter_context(progress_bar(
                 0, 'job', quiet=self.quiet, label=self.label))
-            state, done = _State(strands, self.folder), queue.SimpleQueue[Future[JobResult]]()
+            state, done = _State(strands, self), queue.SimpleQueue[Future[JobResult]]()
             running: dict[Future[JobResult], Job] = {}
             executor, slots, has_started = None, 0, False
             while state.ready or running:
@@ -329,10 +331,10 @@ HERE = Workers(quiet=True)
 class _State:
     """Strands, the results they wait for, and jobs that are ready to run."""
 
-    def __init__(self, strands: Sequence[Strand[Any]], folder: Path | None) -> None:
+    def __init__(self, strands: Sequence[Strand[Any]], workers: Workers) -> None:
         self.ready: deque[tuple[Function, Job]] = deque()
         self.ends: dict[int, Any] = {}
-        self._strands, self._folder = strands, folder
+        self._strands, self._folder, self._files = strands, workers.folder, workers.files
         # What a job depends on, by its name.
         self._records: dict[str, dict[str, Any]] = {}
         self._known: dict[str, dict[str, Any]] = {}
@@ -391,7 +393,10 @@ class _State:
         record = {'sources': sources, 'arguments': dict(job.arguments)}
         known = self._records.setdefault(job.name, record)
         if known is record:
-            stored = _stored(_file(self._folder, job), record) if self._folder else None
+            stored = None
+            if self._folder:
+                self._files.add(file := _file(self._folder, job))
+                stored = _stored(file, record)
             if stored is None:
                 self.ready.append((function, job))
                 self._waiting[job.name] = []

@@ -24,7 +24,7 @@ def test_exit_codes_and_messages(error, code, text, capsys):
 
 
 @pytest.mark.parametrize(('jobs_before', 'n_jobs', 'error', 'is_kept'), [
-    (0, 2, None, False), (1, 0, None, False), (0, 2, KeyboardInterrupt, True),
+    (0, 2, None, False), (1, 2, None, True), (0, 2, KeyboardInterrupt, True),
     (0, 2, JobError, True), (0, 0, ConnectionError, False), (0, 2, ValueError, False),
     (1, 0, ValueError, True), (1, 2, ValueError, True)])
 def test_results_are_kept_if_the_next_call_can_use_them(
@@ -48,3 +48,19 @@ def test_results_are_kept_if_the_next_call_can_use_them(
     else:
         work()
     assert folder.exists() == is_kept
+    # Another run may still need its results.
+    assert len(list(folder.glob('before-*'))) == jobs_before
+
+
+def test_runs_with_one_output_keep_the_results_of_each_other(tmp_path):
+    def begin(name):
+        def strand():
+            return (yield dict, [Job(name, {'name': name})])
+        run = unfinished(tmp_path / 'out', argparse.Namespace(jobs=1, dask=None), True)
+        run.__enter__().run([strand()])
+        return run
+    first, second = begin('first'), begin('second')
+    first.__exit__(None, None, None)
+    assert [file.stem for file in (tmp_path / 'out.jobs').iterdir()] == ['second']
+    second.__exit__(None, None, None)
+    assert not any(tmp_path.iterdir())
