@@ -1,8 +1,10 @@
 """Entry points of the executables, which handle signals before any slow import."""
 
+import contextlib
 import functools
 import importlib.util
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from rhs_isac_ros.support.exits import exit_code_of, import_main, print_error
@@ -22,19 +24,23 @@ def __getattr__(name: str) -> Callable[[], int]:
 
 
 def run(module: str, program: str) -> int:
-    """Import a module, call its function ``main`` and return the exit code.
-
-    The code is 1 if a package is missing, which a line after the name of the program states.
-    """
-    try:
+    """Import a module, call its function ``main`` and return the exit code."""
+    with missing_named(program):
         main = import_main(module)
+    return exit_code_of(main, program=program)
+
+
+@contextlib.contextmanager
+def missing_named(program: str) -> Iterator[None]:
+    """If a package is missing in a block, print a line and raise SystemExit with the code 1."""
+    try:
+        yield
     except ModuleNotFoundError as error:
         missing = str(error.name).partition('.')[0]
         if missing == 'rhs_isac_ros':
             raise
         print_error(f'needs {_what_provides(missing)}', program)
-        return 1
-    return exit_code_of(main, program=program)
+        sys.exit(1)
 
 
 def _what_provides(missing: str) -> str:

@@ -67,7 +67,8 @@ def test_a_missing_package_is_named_in_one_line(
         module, present, expected, monkeypatch, capsys):
     without(module, monkeypatch)
     monkeypatch.setattr(importlib.util, 'find_spec', lambda name: present or None)
-    assert executables.bs() == 1
+    with pytest.raises(SystemExit, match='1'):
+        executables.bs()
     (line,) = capsys.readouterr().err.splitlines()
     assert expected in line
 

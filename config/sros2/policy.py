@@ -7,12 +7,11 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-try:
+from rhs_isac_ros.executables import missing_named
+
+with missing_named('policy.py'):
     from rclpy.exceptions import InvalidNamespaceException
     from rclpy.validate_namespace import validate_namespace
-except ModuleNotFoundError as missing:
-    sys.exit(f'policy.py: error: needs ROS 2 Jazzy, which is not sourced or not installed '
-             f'(no module {missing.name})')
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.cycle_log import ANSWERS

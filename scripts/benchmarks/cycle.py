@@ -14,7 +14,6 @@ import faulthandler
 import itertools
 import multiprocessing
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -23,10 +22,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-try:
+from rhs_isac_ros.executables import missing_named
+
+with missing_named('cycle'):
     import rclpy
-except ModuleNotFoundError:
-    sys.exit('cycle: error: needs ROS 2; scripts/benchmark cycle installs it')
 from parts import frame
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node

@@ -5,17 +5,16 @@ one process? Networks with many users are compared with a network of few users.
 """
 
 import os
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-try:
+from rhs_isac_ros.executables import missing_named
+
+with missing_named('users'):
     import rclpy
-except ModuleNotFoundError:
-    sys.exit('users: error: needs ROS 2; scripts/benchmark users installs it')
 from parts import frame
 from system.observer import NetworkObserver
 from system.trial_processes import TrialProcesses
