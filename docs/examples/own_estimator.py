@@ -4,7 +4,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning import Estimate, make_estimator
+from rhs_isac_ros.positioning import Estimate, estimate_each, make_estimator
 
 
 class RandomSearch:
@@ -18,10 +18,13 @@ class RandomSearch:
         self.means = system.whiten(system.mean(self.points))
 
     def estimate(self, received):
-        """Return the estimates for signals of several cycles, [N, N_B, N_SB F]."""
-        found = [self.points[np.sum(np.abs(one - self.means)**2, axis=(1, 2)).argmin()]
-                 for one in self.system.whiten(received)]
-        return Estimate.of_each([Estimate(one, np.eye(3)) for one in found])
+        """Return the estimate for signals of one cycle or of several, [..., N_B, N_SB F]."""
+        return estimate_each(self.system.codebook, received, self._locate)
+
+    def _locate(self, received):
+        for one in self.system.whiten(received):
+            distances2 = np.sum(np.abs(one - self.means)**2, axis=(1, 2))
+            yield Estimate(self.points[distances2.argmin()], np.eye(3))
 
 
 if __name__ == '__main__':

@@ -1,6 +1,7 @@
 """The picture of a sweep: panels of measures, with an interval at each point."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,7 +9,7 @@ import numpy as np
 from rhs_isac_ros.experiments.sweep import Point
 from rhs_isac_ros.experiments.sweep_settings import FIELDS, MEASURES, Axis, plain
 from rhs_isac_ros.model.board import Board
-from rhs_isac_ros.model.gain_pattern import GainPattern
+from rhs_isac_ros.model.external import External
 from rhs_isac_ros.support.pictures import (
     COLUMN_IN,
     LOOKS,
@@ -131,8 +132,8 @@ def add_legend(place: Any, panels: Sequence[Any], lines: Sequence[Axis],
 
 def shown(name: str, value: Any) -> str:
     """Return a value of a field as a short text for a legend or an axis."""
-    if isinstance(value, GainPattern):
-        return value.origin
+    if isinstance(value, External):
+        return Path(value.origin).name or value.digest
     if name == 'center_frequencies_hz':
         return ', '.join(f'{entry / 1e9:.4g}' for entry in value) + ' GHz'
     if isinstance(value, float | int):

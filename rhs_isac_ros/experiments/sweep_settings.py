@@ -11,9 +11,7 @@ import numpy as np
 
 from rhs_isac_ros.experiments.resampling import replicate, share_percent
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.board import Board
-from rhs_isac_ros.model.gain_pattern import GainPattern
-from rhs_isac_ros.model.scenario import checked
+from rhs_isac_ros.model.scenario import as_plain, checked
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.files import parse_yaml
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -214,8 +212,5 @@ def settings_of(
 
 def plain(value: Any) -> str:
     """Return the value of a field as text in the syntax of scenario files."""
-    if isinstance(value, Board):
-        value = value.plain
-    if isinstance(value, GainPattern | str):
-        return str(value)
-    return json.dumps(value, default=dataclasses.asdict)
+    value = as_plain(value)
+    return value if isinstance(value, str) else json.dumps(value)

@@ -368,7 +368,7 @@ class Scenario(Extensions, Table1):
         `folder` of a scenario file, paths are relative to it. A pattern that is not a plug-in
         cannot be read back, and neither can arrays that are not in a file.
         """
-        changes = {field.name: _plain(value) for field in dataclasses.fields(self)
+        changes = {field.name: as_plain(value) for field in dataclasses.fields(self)
                    if (value := getattr(self, field.name)) != field.default}
         if folder is not None:
             changes = _with_paths(changes, lambda file: os.path.relpath(
@@ -381,7 +381,7 @@ class Scenario(Extensions, Table1):
 
     def fields(self) -> dict[str, Any]:
         """Return all fields by name, as plain values; see `changes`."""
-        return {field.name: _plain(getattr(self, field.name))
+        return {field.name: as_plain(getattr(self, field.name))
                 for field in dataclasses.fields(self)}
 
     def __hash__(self) -> int:
@@ -489,7 +489,8 @@ def check_shape(name: str, array: np.ndarray, symbols: str, scenario: Scenario) 
         raise ValueError(f'{name}: shape {np.shape(array)}, expected [{listed}] = {expected}')
 
 
-def _plain(value: Any) -> Any:
+def as_plain(value: Any) -> Any:
+    """Return the value of a field as in a scenario file."""
     if isinstance(value, External | str):
         return str(value)
     if isinstance(value, Board):
@@ -497,8 +498,8 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and value == np.inf:
         return UNKNOWN
     if isinstance(value, Pose):
-        return {name: _plain(entry) for name, entry in dataclasses.asdict(value).items()}
-    return [_plain(entry) for entry in value] if isinstance(value, tuple) else value
+        return {name: as_plain(entry) for name, entry in dataclasses.asdict(value).items()}
+    return [as_plain(entry) for entry in value] if isinstance(value, tuple) else value
 
 
 def checked(field: dataclasses.Field[Any], value: Any) -> Any:

@@ -1,10 +1,14 @@
 """Settings of a sweep: parsing of values, products, and fields that vary together."""
 
+from pathlib import Path
+
 import pytest
 
 from rhs_isac_ros.experiments.sweep_picture import shown
 from rhs_isac_ros.experiments.sweep_settings import Axis, parse_axis, plain, settings_of
 from rhs_isac_ros.model import Scenario, ScenarioError
+
+CONFIG = Path(__file__).parents[2] / 'config'
 
 
 def settings(*texts):
@@ -34,6 +38,20 @@ class Mirror(Board):
         'own_boards:Mirror', 'resonant', '{"kind": "phase", "phase_range_rad": 3.0}']
     assert [shown('board', board) for board, in axis.values] == [
         plain(board) for board, in axis.values]
+
+
+def test_values_from_files_are_shown_by_the_name_of_their_file():
+    (_,), (paths,) = parse_axis(f'channel=null,{CONFIG}/hall_paths.npz').values
+    assert shown('channel', paths) == 'hall_paths.npz'
+    assert plain(paths) == f'{CONFIG}/hall_paths.npz@{paths.digest}'
+
+
+@pytest.mark.parametrize('text', [
+    'pose={position_m: [1, 2, 0]}', 'carrier_offset_std_hz=.inf', 'impairments={},{}'])
+def test_the_text_of_a_value_is_that_of_a_scenario_file(text):
+    axis = parse_axis(text)
+    for value, in axis.values:
+        assert parse_axis(f'{axis.fields[0]}={plain(value)}').values == ((value,),)
 
 
 @pytest.mark.parametrize(('text', 'expected'), [
