@@ -22,12 +22,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import adjoint, read_only
+from rhs_isac_ros.model.arrays import adjoint, check_arrays, read_only
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.elements import ElementErrors, draw_surface, has_errors
 from rhs_isac_ros.model.geometry import frame_lags_s, subband_frequencies_hz
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.errors import translated
 
 # Standard deviation above which a wrapped phase is treated as uniform [rad].
 UNIFORM_STD_RAD = 2.0
@@ -310,7 +311,6 @@ BUILT_IN: tuple[Factor, ...] = (
 )
 
 
-@functools.lru_cache(maxsize=16)
 def impairments_of(scenario: Scenario) -> tuple[Impairment, ...]:
     """Return the impairments of the signals that a scenario declares; none for Table I.
 
@@ -319,10 +319,29 @@ def impairments_of(scenario: Scenario) -> tuple[Impairment, ...]:
     return (*(one for one in BUILT_IN if one.std(scenario) > 0), *_installed(scenario))
 
 
-@functools.lru_cache(maxsize=16)
 def nuisance_of(scenario: Scenario) -> Nuisance:
-    """Return the nuisance parameters of all impairments that a scenario declares."""
-    return Nuisance(scenario, [one.linear(scenario) for one in impairments_of(scenario)])
+    """Return the nuisance parameters of all impairments that a scenario declares.
+
+    Raises PluginError if exponents or a covariance have wrong shapes, or are not finite.
+    """
+    return _nuisance(scenario, _given(scenario))
+
+
+def _given(scenario: Scenario) -> tuple[Any, ...]:
+    """Return objects in place of names; a notebook may define a class of one name again."""
+    return tuple(plugins.GIVEN.get(name) for name, _ in scenario.impairments)
+
+
+@functools.lru_cache(maxsize=16)
+def _nuisance(scenario: Scenario, given: tuple[Any, ...]) -> Nuisance:
+    parts = []
+    for one in impairments_of(scenario):
+        linear = one.linear(scenario)
+        n = len(linear.patterns)
+        with translated(ValueError, plugins.PluginError, f'{type(one).__name__}.linear'):
+            check_arrays(linear, {'patterns': (n, *_shape(scenario)), 'root': (n, n)})
+        parts.append(linear)
+    return Nuisance(scenario, parts)
 
 
 def draw_factors(
@@ -336,7 +355,7 @@ def draw_factors(
     declared = impairments_of(scenario)
     if not declared:
         return None
-    generators = {Scope.USER: user, Scope.CYCLE: cycle}
+    nuisance, generators = nuisance_of(scenario), {Scope.USER: user, Scope.CYCLE: cycle}
     # A plug-in may be unhashable.
     values: dict[int, np.ndarray] = {}
     for group in (BUILT_IN, _installed(scenario)):
@@ -346,7 +365,7 @@ def draw_factors(
             white = np.split(rng.standard_normal((n, sum(sizes))), np.cumsum(sizes), axis=1)
             values |= {id(one): one.values(scenario, part)
                        for one, part in zip(members, white, strict=False) if one in declared}
-    return nuisance_of(scenario).factors(
+    return nuisance.factors(
         np.concatenate([values[id(one)] for one in declared], axis=1))
 
 
@@ -367,9 +386,8 @@ def draw_impairments(
 
 
 def _installed(scenario: Scenario) -> tuple[Impairment, ...]:
-    # An object that was given for a name may have been replaced.
-    return tuple(_load(name, strength, plugins.GIVEN.get(name))
-                 for name, strength in scenario.impairments)
+    return tuple(_load(name, strength, given) for (name, strength), given in zip(
+        scenario.impairments, _given(scenario), strict=True))
 
 
 @functools.lru_cache(maxsize=16)

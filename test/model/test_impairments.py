@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from impairment_checks import CHECKS
 
-from rhs_isac_ros.model import Linear, MeasurementModel, Scenario, Scope, simulate_received
+from rhs_isac_ros.model import (
+    Impairment,
+    Linear,
+    MeasurementModel,
+    Scenario,
+    Scope,
+    simulate_received,
+)
 from rhs_isac_ros.model.impairments import (
     BUILT_IN,
     NO_INFORMATION,
@@ -142,6 +149,39 @@ def test_a_plugin_that_returns_something_else_is_an_error(install):
     scenario = Scenario(impairments={'no_impairment': 0.5})
     with pytest.raises(PluginError, match='no_impairment.*: returned 0.5, .* of Impairment'):
         impairments_of(scenario)
+
+
+def _tilted(patterns, root):
+    """Return a class of a fixed name, as a cell of a notebook defines it again and again."""
+    class Tilted(Impairment):
+        def __init__(self, strength): ...
+
+        def linear(self, scenario):
+            return Linear(patterns, root)
+    return Tilted
+
+
+def test_a_class_that_is_defined_again_replaces_the_previous_one():
+    drawn = []
+    for phase in (0.0, 1.0):
+        scenario = Scenario(impairments={
+            _tilted(np.full((1, 2, 32), 1j), phase * np.eye(1)): 0.5})
+        rng = np.random.default_rng(0)
+        drawn.append(draw_factors(scenario, 3, rng, rng))
+    assert (drawn[0] == 1).all()
+    assert (drawn[1] != 1).all()
+
+
+@pytest.mark.parametrize(('patterns', 'root', 'text'), [
+    (np.ones((1, 2, 3)), np.eye(1), 'patterns: shape (1, 2, 3), expected (1, 2, 32)'),
+    (1j * np.ones((1, 2, 32)), 0.3, 'root: shape (), expected (1, 1)'),
+    (np.full((1, 2, 32), np.nan), np.eye(1), 'patterns: not finite')])
+def test_exponents_of_a_wrong_shape_are_errors_that_name_the_impairment(patterns, root, text):
+    scenario, rng = Scenario(impairments={_tilted(patterns, root): 0.5}), np.random.default_rng(0)
+    for work in (lambda: nuisance_of(scenario), lambda: draw_factors(scenario, 2, rng, rng)):
+        with pytest.raises(PluginError) as caught:
+            work()
+        assert f'Tilted.linear: {text}' in str(caught.value)
 
 
 def test_multipath_and_noise_do_not_depend_on_impairments(small, uncertain):
