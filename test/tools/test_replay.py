@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import os
 import re
+import runpy
 import signal
 import subprocess
 import sys
@@ -186,6 +187,18 @@ def test_the_same_estimator_has_the_same_errors(run, replayed):
     assert found['bayes'] == found['live bayes'] != found['ml']
     assert found['live bayes'] == [
         f'{np.median(live):.6f}', 'm', f'{np.sqrt(np.mean(live**2)):.6f}', 'm', '0']
+
+
+def test_an_example_reads_a_recording_without_messages_of_ros(run, monkeypatch, capsys):
+    pytest.importorskip('mcap_ros2.decoder', reason='there is no mcap_ros2 here')
+    log = load(run.path).logs['']
+    estimator = make_estimator('ml', SCENARIO, *log.codebooks.values())
+    errors_m = [np.linalg.norm(estimator.estimate(signals.stacked).mean - truth.position)
+                for signals in log.signals.values() if (truth := log.truths.of(signals))]
+    monkeypatch.setattr(sys, 'argv', ['', str(run.path), 'ml'])
+    runpy.run_path(str(CONFIG.parent / 'docs' / 'examples' / 'read_recording.py'))
+    assert capsys.readouterr().out == (
+        f'{len(errors_m)} cycles, median error {np.median(errors_m):.6f} m\n')
 
 
 def test_errors_do_not_depend_on_the_pose_of_the_surface(run):
