@@ -11,7 +11,6 @@ import math
 import sys
 import textwrap
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from rhs_isac_ros.codebook import OBJECTIVES, CodebookError
@@ -34,15 +33,12 @@ from rhs_isac_ros.experiments.sweep_settings import (
     FIELDS,
     MEASURES,
     Axis,
-    Setting,
     names_of,
     parse_axis,
     parse_measures,
     settings_of,
 )
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.positioning import ESTIMATORS, EstimatorKind
-from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_effect,
@@ -93,7 +89,6 @@ def _sweep(parser: ArgumentParser, options: argparse.Namespace) -> int:
     try:
         base = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
         settings = settings_of(base, options.vary, options.codebook, options.estimator)
-        _check_names(settings)
         sweep = Sweep(
             base, settings, names_of(options.measure), options.positions, options.seed,
             options.objective, options.steps, options.optimize_for, options.repeats)
@@ -154,18 +149,6 @@ def _check(parser: ArgumentParser, options: argparse.Namespace) -> None:
     if options.picture and not importlib.util.find_spec('matplotlib'):
         parser.error('argument --picture: drawing needs matplotlib, which is not installed '
                      "(pip install 'rhs_isac_ros[plot]')")
-
-
-def _check_names(settings: Sequence[Setting]) -> None:
-    """Raise ValueError if an estimator is unknown, or a codebook is neither a kind nor a file."""
-    # An estimator with a file would have to be trained for each codebook.
-    estimators = {name for name in ESTIMATORS if not EstimatorKind(name).readers} | {
-        *plugins.names(plugins.ESTIMATORS)}
-    for name, known in ((ESTIMATOR, estimators), (CODEBOOK, {*KINDS})):
-        for value in sorted({getattr(setting, name) for setting in settings} - known):
-            if not (plugins.is_reference(value) if name == ESTIMATOR else Path(value).is_file()):
-                expected = f'{", ".join(sorted(known))}{" or a file" * (name == CODEBOOK)}'
-                raise ValueError(f'{name}: {value!r}, expected {expected}')
 
 
 def _run(sweep: Sweep, options: argparse.Namespace) -> None:

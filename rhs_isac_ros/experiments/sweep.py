@@ -28,7 +28,7 @@ from rhs_isac_ros.experiments.sweep_settings import (
 from rhs_isac_ros.link import capacity as capacity_of
 from rhs_isac_ros.link import capacity_report, choose_beam
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning import Estimator, make_estimator
+from rhs_isac_ros.positioning import Estimator, EstimatorKind, make_estimator
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.fields import whole
 from rhs_isac_ros.support.jobs import Job, Strand, Workers
@@ -197,6 +197,10 @@ class Sweep:
         for name in self.optimize_for or ():
             if name not in FIELDS:
                 raise ValueError(f'optimize_for: {name!r}, expected names of fields of a scenario')
+        for name in sorted({setting.estimator for setting in self.settings}):
+            # An estimator with a file would have to be trained for each codebook.
+            if needed := EstimatorKind(name).readers:
+                raise ValueError(f'estimator: {name!r}, expected one without {", ".join(needed)}')
         files, kinds = self._files, {setting.codebook for setting in self.settings}
         for name, using in _KINDS_USING.items():
             if getattr(self, name) != getattr(Sweep, name) and not kinds.intersection(using):
@@ -214,8 +218,12 @@ class Sweep:
 
     @functools.cached_property
     def _files(self) -> dict[str, Codebook]:
-        names = {setting.codebook for setting in self.settings} - {*KINDS}
-        return {name: Codebook.load(name) for name in sorted(names)}
+        names = sorted({setting.codebook for setting in self.settings} - {*KINDS})
+        for name in names:
+            if not Path(name).is_file():
+                raise ValueError(f'codebook: {name!r}, expected {", ".join(sorted(KINDS))} or a '
+                                 'file')
+        return {name: Codebook.load(name) for name in names}
 
     def scenario_of_codebook(self, setting: Setting) -> Scenario:
         """Return the scenario for which the codebook of a setting is made."""

@@ -72,32 +72,39 @@ class JobResult(NamedTuple):
     sources: str = ''
 
 
-def sources_of(function: Function | None = None) -> str:
-    """Return the version of this package with a digest of the sources of a function's results.
+def sources_of(*uses: Any) -> str:
+    """Return the version of this package with a digest of the sources of a job's result.
 
-    They are the modules of this package, that of the function, those that it imports from, and
-    what `_definition` returns. Sources in an archive have no digest.
+    `uses` are its function, and the plug-ins that its arguments name. The sources are the modules
+    of this package, those of the uses, those that they import from, and what `_definition`
+    returns. Sources in an archive have no digest.
     """
-    # Any other callable may keep a record of its calls.
-    is_plain = isinstance(function, functools.partial) or inspect.isfunction(function)
-    text = json.dumps(_definition(function if is_plain else type(function).__qualname__, set()))
-    while isinstance(function, functools.partial):
-        function = function.func
-    module = sys.modules[function.__module__] if function else None
-    named = vars(module).values() if module else ()
-    modules = [module, *(
-        value if inspect.ismodule(value) else
-        sys.modules.get(str(getattr(value, '__module__', ''))) for value in named)]
-    files = {str(getattr(one, '__file__', '')) for one in modules if one}
-    return f'{__version__} {_digest(*sorted(files), text=text)}'
+    files, texts = set(), []
+    for one in uses:
+        # Any other callable may keep a record of its calls.
+        is_plain = isinstance(one, functools.partial | type) or inspect.isfunction(one)
+        texts.append(_definition(one if is_plain else type(one), set()))
+        while isinstance(one, functools.partial):
+            one = one.func
+        module = sys.modules.get(one.__module__)
+        named = vars(module).values() if module else ()
+        modules = [module, *(
+            value if inspect.ismodule(value) else
+            sys.modules.get(str(getattr(value, '__module__', ''))) for value in named)]
+        files |= {str(getattr(one, '__file__', '')) for one in modules if one}
+    return f'{__version__} {_digest(*sorted(files), text=json.dumps(texts))}'
 
 
 def _definition(value: Any, seen: set[int]) -> Any:
-    """Describe a function, or a value that it uses, apart from what files contain, for JSON.
+    """Describe a function or class, or a value that it uses, apart from what files contain.
 
     A function has bound arguments and, without a file, as in a notebook, its code and all that it
-    uses. `seen` contains the identities of functions and objects that are already described.
+    uses. A class without a file has its bases and members. `seen` contains the identities of those
+    that are already described. The description is for JSON.
     """
+    for wrapper, name in ((property, 'fget'), (functools.cached_property, 'func'),
+                          (classmethod | staticmethod, '__func__')):
+        value = getattr(value, name) if isinstance(value, wrapper) else value
     if isinstance(value, functools.partial):
         value = (value.func, value.args, value.keywords)
     if isinstance(value, np.ndarray):
@@ -109,15 +116,24 @@ def _definition(value: Any, seen: set[int]) -> Any:
         return [_definition(one, seen) for one in ordered]
     if inspect.iscode(value):
         return _definition((value.co_code, value.co_names, value.co_consts), seen)
-    is_function: bool = inspect.isfunction(value)
+    is_function, is_class = inspect.isfunction(value), isinstance(value, type)
     kind: Any = type(value)
-    if hasattr(value, 'id') or not (is_function or kind.__repr__ is object.__repr__):
+    if not (is_function or is_class) and (
+            hasattr(value, 'id') or kind.__repr__ is not object.__repr__):
         return repr(getattr(value, 'id', value))
     if id(value) in seen:
         return ''
     seen.add(id(value))
+    if is_class:
+        if value.__module__ in sys.builtin_module_names or hasattr(
+                sys.modules.get(value.__module__), '__file__'):
+            return value.__qualname__
+        # Other names with underscores are those that Python itself adds.
+        return _definition((value.__qualname__, value.__bases__, {
+            name: member for name, member in vars(value).items()
+            if inspect.isfunction(member) or not name.startswith('__')}), seen)
     if not is_function:
-        return _definition((kind.__qualname__, getattr(value, '__dict__', {})), seen)
+        return _definition((kind, getattr(value, '__dict__', {})), seen)
     parts = (value.__qualname__, inspect.getclosurevars(value).nonlocals)
     if Path(value.__code__.co_filename).is_file():
         return _definition((*parts, value.__code__.co_firstlineno), seen)
@@ -248,33 +264,30 @@ class Workers:
             show = stack.enter_context(progress_bar(
                 0, 'job', quiet=self.quiet, label=self.label))
             state, done = _State(strands, self), queue.SimpleQueue[Future[JobResult]]()
-            running: dict[Future[JobResult], Job] = {}
+            running: dict[Future[JobResult], _Entry] = {}
             executor, slots, has_started = None, 0, False
             while state.ready or running:
                 if not executor:
                     executor, slots = stack.enter_context(self._executor())
                 while state.ready and len(running) < slots:
-                    function, job = state.ready.popleft()
+                    entry = state.ready.popleft()
                     try:
                         # The first call starts the processes. Later ones must not lose Ctrl-C.
                         with (_interrupts_ignored() if slots > 1 and not has_started
                               else contextlib.nullcontext()):
-                            future = executor.submit(*self._call(function, job))
+                            future = executor.submit(
+                                _attempt_on_cluster if self.dask else attempt, entry.function,
+                                entry.job, entry.given)
                     except Exception as error:
-                        raise _failure(job, error) from error
-                    running[future], has_started = job, True
+                        raise _failure(entry.job, error) from error
+                    running[future], has_started = entry, True
                     future.add_done_callback(done.put)
                 future = done.get()
-                job = running.pop(future)
-                state.take(job, self._result(job, future))
+                entry = running.pop(future)
+                state.take(entry, self._result(entry.job, future))
                 if show:
                     show(state.n_done, '', state.n_jobs)
             return [state.ends[number] for number in range(len(strands))]
-
-    def _call(self, function: Function, job: Job) -> tuple[Any, ...]:
-        given = {name: plugin for name, plugin in plugins.GIVEN.items()
-                 if name in json.dumps(job.arguments)}
-        return _attempt_on_cluster if self.dask else attempt, function, job, given
 
     @contextlib.contextmanager
     def _executor(self) -> Iterator[tuple[Executor, int]]:
@@ -328,47 +341,51 @@ def _failure(job: Job, error: Exception) -> JobError:
 HERE = Workers(quiet=True)
 
 
+@dataclasses.dataclass(eq=False)
+class _Entry:
+    """A job with its result, if there is one, and the strands that wait for it."""
+
+    function: Function
+    job: Job
+    record: Mapping[str, Any]  # What the result depends on.
+    given: Mapping[str, Any]  # Objects of this process to which names in the arguments refer.
+    result: dict[str, Any] | None = None
+    waiting: list[int] = dataclasses.field(default_factory=list)
+
+
 class _State:
-    """Strands, the results they wait for, and jobs that are ready to run."""
+    """Strands, the jobs they wait for, and jobs that are ready to run."""
 
     def __init__(self, strands: Sequence[Strand[Any]], workers: Workers) -> None:
-        self.ready: deque[tuple[Function, Job]] = deque()
+        self.ready: deque[_Entry] = deque()
         self.ends: dict[int, Any] = {}
+        self.n_done = 0
         self._strands, self._folder, self._files = strands, workers.folder, workers.files
-        # What a job depends on, by its name.
-        self._records: dict[str, dict[str, Any]] = {}
-        self._known: dict[str, dict[str, Any]] = {}
-        # Jobs that each strand has asked for, names of those without a result, and strands that
-        # wait for a job.
-        self._asked: dict[int, Sequence[Job]] = {}
-        self._missing: dict[int, set[str]] = {}
-        self._waiting: dict[str, list[int]] = {}
+        self._entries: dict[str, _Entry] = {}
+        # By the identity of a function, which an entry keeps, and the names of plug-ins.
+        self._sources: dict[tuple[Any, ...], str] = {}
+        # The jobs that each strand waits for, and the number of those without a result.
+        self._asked: dict[int, Sequence[_Entry]] = {}
+        self._n_missing: dict[int, int] = {}
         for number in range(len(strands)):
             self._advance(number, None)
 
     @property
     def n_jobs(self) -> int:
         """The number of jobs so far."""
-        return len(self._records)
+        return len(self._entries)
 
-    @property
-    def n_done(self) -> int:
-        """The number of jobs with a result."""
-        return len(self._known)
-
-    def take(self, job: Job, result: dict[str, Any]) -> None:
+    def take(self, entry: _Entry, result: dict[str, Any]) -> None:
         """Keep the result of a job, and advance each strand that has waited only for this one."""
         if self._folder:
-            record = self._records[job.name] | {'result': result}
-            write_whole(_file(self._folder, job), json.dumps(record, indent=1) + '\n')
-        self._known[job.name] = result
-        for number in self._waiting.pop(job.name):
-            self._missing[number].remove(job.name)
-            if not self._missing[number]:
-                self._advance(number, self._results(number))
-
-    def _results(self, number: int) -> list[dict[str, Any]]:
-        return [self._known[job.name] for job in self._asked[number]]
+            write_whole(_file(self._folder, entry.job), json.dumps(
+                {**entry.record, 'result': result}, indent=1) + '\n')
+        entry.result = result
+        self.n_done += 1
+        for number in entry.waiting:
+            self._n_missing[number] -= 1
+            if not self._n_missing[number]:
+                self._advance(number, [one.result for one in self._asked[number]])
 
     def _advance(self, number: int, results: Any) -> None:
         """Send results to a strand until it waits for a job."""
@@ -378,33 +395,37 @@ class _State:
             except StopIteration as end:
                 self.ends[number] = end.value
                 return
-            sources = sources_of(function)
-            self._asked[number] = [
-                self._admitted(function, _checked(job), sources) for job in jobs]
-            self._missing[number] = {job.name for job in self._asked[number]} - {*self._known}
-            for name in self._missing[number]:
-                self._waiting[name].append(number)
-            if self._missing[number]:
+            asked = [self._admitted(function, _checked(job)) for job in jobs]
+            missing = [entry for entry in asked if entry.result is None]
+            if missing:
+                self._asked[number], self._n_missing[number] = asked, len(missing)
+                for entry in missing:
+                    entry.waiting.append(number)
                 return
-            results = self._results(number)
+            results = [entry.result for entry in asked]
 
-    def _admitted(self, function: Function, job: Job, sources: str) -> Job:
+    def _admitted(self, function: Function, job: Job) -> _Entry:
         """Return a job, which is ready to run if it is new and has no stored result."""
-        record = {'sources': sources, 'arguments': dict(job.arguments)}
-        known = self._records.setdefault(job.name, record)
-        if known is record:
-            stored = None
-            if self._folder:
-                self._files.add(file := _file(self._folder, job))
-                stored = _stored(file, record)
-            if stored is None:
-                self.ready.append((function, job))
-                self._waiting[job.name] = []
-            else:
-                self._known[job.name] = stored
-        elif _as_text(known) != _as_text(record):
-            raise ValueError(f'jobs: two have the name {job.name}, expected unique names')
-        return job
+        text = json.dumps(job.arguments)
+        used = {name: plugin for name, plugin in (plugins.LOADED | plugins.GIVEN).items()
+                if json.dumps(name) in text}
+        if (key := (id(function), *used)) not in self._sources:
+            self._sources[key] = sources_of(function, *used.values())
+        record = {'sources': self._sources[key], 'arguments': dict(job.arguments)}
+        if known := self._entries.get(job.name):
+            if _as_text(known.record) != _as_text(record):
+                raise ValueError(f'jobs: two have the name {job.name}, expected unique names')
+            return known
+        entry = self._entries[job.name] = _Entry(function, job, record, {
+            name: plugin for name, plugin in used.items() if name in plugins.GIVEN})
+        if self._folder:
+            self._files.add(file := _file(self._folder, job))
+            entry.result = _stored(file, record)
+        if entry.result is None:
+            self.ready.append(entry)
+        else:
+            self.n_done += 1
+        return entry
 
 
 class _ThisProcess(Executor):

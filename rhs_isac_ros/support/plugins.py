@@ -37,8 +37,9 @@ def describe(group: str, name: Any) -> str:
         for point in metadata.entry_points(group=group, name=name)))
 
 
-#: Objects that callers have given in place of names, by ``module:name``.
+#: Objects that callers have given in place of names, by ``module:name``; loaded ones by name.
 GIVEN: dict[str, Any] = {}
+LOADED: dict[str, Any] = {}
 
 
 def is_reference(name: Any) -> bool:
@@ -88,6 +89,7 @@ def load(group: str, plugin: Any, base: type | None = None) -> Any:
     if base and is_named and not isinstance(found, base) and not (
             isinstance(found, type) and issubclass(found, base)):
         raise PluginError(f'{name}: {found!r}, expected a subclass of {base.__name__}')
+    LOADED[name] = found
     return found
 
 

@@ -100,7 +100,7 @@ def test_without_matplotlib_the_table_is_written(sweep, tmp_path, monkeypatch, c
      'n_feeds: 1 values, expected 2'),
     (['--vary', 'n_frames=1', '--measure', 'mse+rmse'], 'expected a measure in m²'),
     (['--vary', 'roi_size_m=[30,1,1]'], 'reaches behind the surface'),
-    (['--vary', 'n_frames=1', '--estimator', 'neural'], "estimator: 'neural', expected bayes, "),
+    (['--vary', 'n_frames=1', '--estimator', 'neural'], "'neural', expected one without"),
     (['--vary', 'codebook=optimize,none.yaml'], "'none.yaml', expected directional"),
     (['--vary', 'codebook=bad.yaml'], 'error: bad.yaml: expected ros__parameters'),
     (['--vary', 'n_frames=1', '--scenario', 'bad.yaml'], 'bad.yaml: colour: unknown field'),

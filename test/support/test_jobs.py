@@ -19,6 +19,7 @@ from rhs_isac_ros.experiments import Job, JobError, run_jobs
 from rhs_isac_ros.support import jobs as jobs_module
 from rhs_isac_ros.support.jobs import Workers
 from rhs_isac_ros.support.optional import MissingLibraryError
+from rhs_isac_ros.support.plugins import ESTIMATORS, load
 
 pytestmark = pytest.mark.slow
 
@@ -161,6 +162,24 @@ def test_results_of_other_sources_are_not_reused(tmp_path, monkeypatch, wrap):
     assert found == [{'found': 1}, 0, {'found': 1}, {'found': 2}, 0]
 
 
+def test_a_plugin_that_an_argument_names_is_a_source(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, 'dont_write_bytecode', True)
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def work(estimator):
+        return {'n': load(ESTIMATORS, estimator).n}
+    found = []
+    for text in ('1', '2'):
+        (tmp_path / 'my_lab.py').write_text(f'class Grid:\n    n = {text}\n')
+        monkeypatch.delitem(sys.modules, 'my_lab', raising=False)
+        importlib.invalidate_caches()
+        jobs_module._digest.cache_clear()
+        load(ESTIMATORS, 'my_lab:Grid')
+        found += run_jobs(
+            work, [Job('a', {'estimator': 'my_lab:Grid'})], tmp_path / 'kept', n_jobs=1)
+    assert found == [{'n': 1}, {'n': 2}]
+
+
 def test_a_function_without_a_module_in_a_file_is_a_source():
     module = types.ModuleType('__main__')
     texts = [f'def work():\n    return {number}\n' for number in (1, 2, 1)]
@@ -178,7 +197,10 @@ def test_a_function_without_a_module_in_a_file_is_a_source():
     ('k = 1', 'k = 2'), ('k = [1, {"a": 2}]', 'k = [1, {"a": 3}]'),
     ('import numpy as np\nk = np.zeros(3000)', 'k[1500] = 1'),
     ('def k(): return 1', 'def k(): return 2'),
-    ('k = lambda: helper()\nhelper = 1', 'helper = 2')])
+    ('k = lambda: helper()\nhelper = 1', 'helper = 2'),
+    ('class k:\n    def f(self): return 1', 'class k:\n    def f(self): return 2'),
+    ('class B:\n    f = property(lambda self: 1)\nclass k(B): pass\nk = k()',
+     'class B:\n    f = property(lambda self: 2)\nclass k(B): pass\nk = k()')])
 def test_what_a_function_without_a_file_uses_is_a_source(cells):
     module = types.ModuleType('__main__')
     digests = []
