@@ -183,20 +183,26 @@ class Resonant(Elementwise):
 
     def coefficients(self, ports: Ports, tunings: np.ndarray) -> np.ndarray:
         """Return the relative polarisabilities, complex128 [B, J, Q, N_E]."""
-        return self._curve(ports, tunings)[0]
+        return self._curve(self._ratio(ports, tunings))
 
     def slopes(self, ports: Ports, tunings: np.ndarray) -> np.ndarray | float:
         """Return the derivative, complex128 [B, J, Q, N_E]."""
-        return self._curve(ports, tunings)[1]
+        ratio = self._ratio(ports, tunings)
+        by_ratio = 1j * self.quality_factor * (1 + 1 / ratio**2) * self._curve(ratio)**2
+        return by_ratio * (self.tuning_range * self._scale(ports))
 
-    def _curve(self, ports: Ports, tunings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _curve(self, ratio: np.ndarray) -> np.ndarray:
+        return np.asarray(1 / (1 - 1j * self.quality_factor * (ratio - 1 / ratio)))
+
+    def _ratio(self, ports: Ports, tunings: np.ndarray) -> np.ndarray:
+        """Return f_0 relative to the frequency."""
+        return self._scale(ports) * (1 + self.tuning_range * (tunings - 0.5))[:, None]
+
+    def _scale(self, ports: Ports) -> np.ndarray:
+        """Return f_r relative to the frequency, float64 [B, J, 1, 1]."""
         frequencies = ports.frequencies_hz[..., None, None]
-        resonances = (frequencies.mean(axis=1, keepdims=True) if self.resonances_hz is None
-                      else np.reshape(self.resonances_hz, (-1, 1, 1, 1)))
-        ratio = resonances * (1 + self.tuning_range * (tunings - 0.5))[:, None] / frequencies
-        curve = 1 / (1 - 1j * self.quality_factor * (ratio - 1 / ratio))
-        by_ratio = 1j * self.quality_factor * (1 + 1 / ratio**2) * curve**2
-        return curve, by_ratio * (self.tuning_range * resonances / frequencies)
+        return (frequencies.mean(axis=1, keepdims=True) if self.resonances_hz is None
+                else np.reshape(self.resonances_hz, (-1, 1, 1, 1))) / frequencies
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -97,7 +97,8 @@ class SpatialCovariance:
         else:
             # A real product takes half the time of a complex one.
             parts = np.concatenate([rows.real, rows.imag], axis=-2) @ self.matrix
-            result.real, result.imag = np.split(parts, 2, axis=-2)
+            n_rows = rows.shape[-2]
+            result.real, result.imag = parts[..., :n_rows, :], parts[..., n_rows:, :]
         return result.reshape(weights.shape)
 
     def _convolve(self, rows: np.ndarray, result: np.ndarray) -> None:
