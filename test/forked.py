@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import gc
 import importlib
 import multiprocessing
 import os
@@ -19,7 +20,7 @@ PR_SET_PDEATHSIG = 1
 FORKS = multiprocessing.get_context('forkserver')
 # Nodes import parts of SciPy when they first need them, which takes longer than most cycles.
 FORKS.set_forkserver_preload([
-    'scipy.optimize', 'scipy.spatial', 'scipy.special', 'scipy.stats', *(
+    'scipy.optimize', 'scipy.spatial', 'scipy.special', *(
         f'rhs_isac_ros.nodes.{name}' for name, package in EXECUTABLES.items()
         if package == 'nodes')])
 
@@ -30,6 +31,8 @@ def run_executable(command, log, environment):
     Output is appended to `log`. A signal results in the exit code 0, even before the executable
     handles it.
     """
+    # Collections then leave the memory alone that the process shares with its parent.
+    gc.freeze()
     on_end_signals(lambda number, _: sys.exit(0))
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
     os.setsid()
