@@ -16,6 +16,8 @@ os.environ['JUPYTER_PATH'] = str(ROOT / 'docs' / 'jupyter')
 os.environ['IPYTHONDIR'] = os.environ['JUPYTER_RUNTIME_DIR'] = str(ROOT / 'build' / 'jupyter')
 # Only warnings: the ROS libraries print all messages of other libraries.
 logging.getLogger('traitlets').setLevel(logging.WARNING)
+# Sphinx prepares 60 000 messages that `-q` hides, which takes a twentieth of the time.
+logging.getLogger('sphinx').setLevel(logging.WARNING)
 
 from rhs_isac_ros import __version__  # noqa: E402
 
