@@ -59,7 +59,7 @@ setup(
             'pymoo', 'mcap>=1.6', 'sigmf', 'scikit-rf', 'rich', 'rerun-sdk>=0.22.1,<0.42',
             'pyarrow'],
         'docs': ['sphinx', 'furo', 'myst-nb'],
-        'test': ['pytest', 'hypothesis', 'filterpy', 'rosbags'],
+        'test': ['pytest', 'hypothesis', 'filterpy', 'rosbags', 'mcap-ros2-support'],
     },
     zip_safe=False,
     entry_points={

@@ -26,7 +26,8 @@ KEYS = {'docutils': 'python3-sphinx', 'threadpoolctl': 'python3-sklearn'} | {
 # mcap requires lz4 and zstandard.
 PIP_ONLY = {
     'adi': None, 'distributed': 'distributed', 'h5py': None, 'jax': None, 'lz4': 'mcap>=1.6',
-    'mcap': 'mcap>=1.6', 'pymoo': 'pymoo', 'rerun': 'rerun-sdk>=0.22.1,<0.42',
+    'mcap': 'mcap>=1.6', 'mcap_ros2': 'mcap-ros2-support', 'pymoo': 'pymoo',
+    'rerun': 'rerun-sdk>=0.22.1,<0.42',
     'rosbags': 'rosbags', 'sigmf': 'sigmf', 'sionna': None, 'skrf': 'scikit-rf',
     'zstandard': 'mcap>=1.6',
 }
