@@ -239,8 +239,7 @@ def _most_likely(scenario: Scenario, model: MeasurementModel, samples: np.ndarra
     direct = model.covariance() - model.covariance_in_shadow()
 
     def cost(point: np.ndarray) -> float:
-        covariance = direct + MeasurementModel(
-            declaring(point), model.beams, model.surface).covariance_in_shadow()
+        covariance = direct + model.covariance_in_shadow(declaring(point))
         return -_log_evidence(covariance, samples, n, float(np.exp(np.clip(point, low, high)[3])))
 
     # The level follows from the power, at least if the noise is weak.

@@ -252,17 +252,25 @@ class MeasurementModel:
         """
         return with_direct_errors(*self._constant, checked_positions(positions))
 
-    def covariance_in_shadow(self) -> np.ndarray:
-        """Return the covariance without a direct path, complex128 [N_B, N_SB F, N_SB F] [W]."""
-        return self._constant[0]
+    def covariance_in_shadow(self, scenario: Scenario | None = None) -> np.ndarray:
+        """Return the covariance without a direct path, complex128 [N_B, N_SB F, N_SB F] [W].
+
+        `scenario` may have other fields of the multipath than that of the model. They do not
+        change the radiation matrices, which take much of the time of a model.
+        """
+        return (self._constant_of(scenario) if scenario else self._constant)[0]
 
     @functools.cached_property
     def _constant(self) -> tuple[np.ndarray, DirectErrors]:
         """The part of `covariance_at` that is the same everywhere, and errors of the rest."""
-        covariance = signal_covariance(self.scenario, self.radiation)
+        return self._constant_of(self.scenario)
+
+    def _constant_of(self, scenario: Scenario) -> tuple[np.ndarray, DirectErrors]:
+        covariance = signal_covariance(scenario, self.radiation)
         if self.elements.is_exact:
             return covariance, functools.partial(no_direct_errors, self.shape[1])
-        scattered, direct = self.elements.errors(self.scenario, self.beams)
+        elements = self.surface or DeclaredElements(scenario)
+        scattered, direct = elements.errors(scenario, self.beams)
         return covariance + scattered, direct
 
     @functools.cached_property

@@ -267,17 +267,30 @@ def mean_los_power(scenario: Scenario, band: int) -> float:
     This is the mean of (v_0 g^U / (4 pi f_c,i r))^2, where r is the distance from the centre of
     the surface. A gain pattern g^U is evaluated at the angle seen from this centre.
     """
-    nodes, weights = gauss_legendre(_ROI_NODES)
-    low, high = scenario.roi_bounds_m
-    x, y, z = ((low + high) / 2 + nodes[:, None] * (high - low) / 2).T
-    squares = x[:, None, None]**2 + y[:, None]**2 + z**2
-    inverse, gain = 1 / squares, scenario.user_gain
+    gain, pattern = scenario.user_gain, None
     if isinstance(gain, GainPattern):
-        inverse *= gain.amplitude(np.arccos(x[:, None, None] / np.sqrt(squares)))**2
-        gain = 1.0
-    mean_inverse = np.einsum('a,b,c,abc->', weights, weights, weights, inverse) / 8
+        gain, pattern = 1.0, gain
+    low, high = scenario.roi_bounds_m.tolist()
+    mean_inverse = _mean_inverse_square(tuple(low), tuple(high), pattern)
     wavelength = SPEED_OF_LIGHT_MPS / scenario.center_frequencies_hz[band]
     return float((wavelength * gain / (4 * np.pi))**2 * mean_inverse)
+
+
+@functools.lru_cache(maxsize=16)
+def _mean_inverse_square(
+        low: tuple[float, ...], high: tuple[float, ...], pattern: GainPattern | None) -> float:
+    """Return the mean of (g^U / r)^2 between two corners of a region; g^U is 1 without a pattern.
+
+    Scenarios of a survey differ in the fields of the multipath, but not in their regions.
+    """
+    nodes, weights = gauss_legendre(_ROI_NODES)
+    corners = np.array([low, high])
+    x, y, z = (corners.mean(axis=0) + nodes[:, None] * np.ptp(corners, axis=0) / 2).T
+    squares = x[:, None, None]**2 + y[:, None]**2 + z**2
+    inverse = 1 / squares
+    if pattern:
+        inverse *= pattern.amplitude(np.arccos(x[:, None, None] / np.sqrt(squares)))**2
+    return float(np.einsum('a,b,c,abc->', weights, weights, weights, inverse) / 8)
 
 
 def frequency_correlation(scenario: Scenario, difference_hz: np.ndarray) -> np.ndarray:
