@@ -78,6 +78,7 @@ def test_positions_and_velocities_are_in_their_regions(walking):
     assert np.sqrt(np.mean(errors[:, 2:]**2)) < 0.3
 
 
+@pytest.mark.slow
 def test_the_sign_of_the_speed_across_the_line_of_sight_is_found(walking):
     """Two speeds of opposite signs have equal changes of the range; their modes share a place."""
     system, estimator = walking
