@@ -6,8 +6,12 @@ declared therefore have an evidence, the likelihood averaged over their unknowns
 * Amplitude and phase of the direct path are Gaussian and independent from frame to frame, as those
   of a user who crosses several beams of the surface in a cycle. Only the delay is common. What
   failed elements do to the direct path is part of this, so the surface counts as intact.
-* If users are declared to be slower, the user walks. One Gauss-Newton step from each mode, with
-  the velocity of someone who walks, finds those who move little, and are near a mode.
+* If users are declared to be slower, the user moves slowly, or walks. One Gauss-Newton step from
+  each mode, with such a velocity, finds those who move little, and are near a mode.
+* If the scenario declares a velocity, the user is a few times as fast. From one frame to the next,
+  the direct path then turns by a few turns more than that of a mode, and signals are similar.
+
+These share the prior probability of a user who moves otherwise than declared.
 
 If the scenario declares a velocity, a residual and a velocity that are improbable together also
 show that the user is too fast. With short frames, the phase of the direct path hardly changes
@@ -23,23 +27,28 @@ import numpy as np
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.arrays import log_sum
 from rhs_isac_ros.model.constants import POWER_NEPERS_PER_DB
-from rhs_isac_ros.model.geometry import stands_still, velocity_std_mps
+from rhs_isac_ros.model.geometry import jacobian, stands_still, velocity_std_mps
 from rhs_isac_ros.positioning.estimate import Fit
 from rhs_isac_ros.positioning.failures import refinement_of
 from rhs_isac_ros.positioning.grid import Starts
 from rhs_isac_ros.positioning.lattice import Resolution, subband_wavenumbers
 from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
+from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.search import Modes, ascend, one_step
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.system import System
 
-# Speeds of users whose scenario declares none [m/s]: one at which frames are long, and the
-# standard deviation of each component.
-_WALKING_MPS, _WALKING_STD_MPS = 1.5, 1.0
+# Speed of users who walk, at which frames are long [m/s].
+_WALKING_MPS = 1.5
+# Standard deviations of each component of velocities: of users who move slowly or walk [m/s], and
+# of those who are faster than declared, relative to the declared one.
+_SLOW_STD_MPS, _FASTER = (0.1, 1.0), 4.0
+# Largest numbers of turns and of steps to a mode for users who are faster than declared.
+_TURNS, _STEPS = 2, 6
 # Prior probability that a user moves otherwise, and largest probability with a fix: above it, a
 # 95 % region cannot attain its coverage.
-_PRIOR, _LIMIT = 0.05, 0.05
+_PRIOR, _LIMIT = 0.03, 0.05
 # Log ratio of evidences, predicted at a mode, below which an exact one is never above the limit.
 _IMPROBABLE = -3.0
 # Probability of a residual and a velocity below which the user may be faster than declared.
@@ -61,12 +70,12 @@ class MovementTest:
                                   system.codebook, system.surface)
             self._of_frames = Likelihood(self._intact)
         self._bases, self._shares, self._energies = _frames(self._intact)
-        self._walking: Likelihood | None = None
-        if scenario.user_speed_std_mps < _WALKING_STD_MPS:
-            self._walking = Likelihood(System(
-                dataclasses.replace(scenario, user_speed_std_mps=_WALKING_STD_MPS),
-                system.codebook, system.surface))
-            self._refinement = refinement_of(self._walking)
+        declared = scenario.user_speed_std_mps
+        self._others = [_Others(system, likelihood.nuisance, std_mps)
+                        for std_mps in _SLOW_STD_MPS if std_mps > declared]
+        if declared:
+            self._others.append(_Others(
+                system, likelihood.nuisance, _FASTER * declared, _TURNS))
 
     @classmethod
     def of(cls, system: System, likelihood: Likelihood) -> 'MovementTest | None':
@@ -82,9 +91,10 @@ class MovementTest:
         that follow from the signals alone, float64 [Q], and the level of the multipath that the
         residual shows, relative to the model.
         """
-        log_ratio = self._unsteady(fit, signals, aligned, level)
-        if self._walking and modes is not None:
-            log_ratio = max(log_ratio, self._walks(self._walking, modes, conditionals, signals))
+        log_ratios = [self._unsteady(fit, signals, aligned, level)]
+        if modes is not None:
+            log_ratios += [one.log_ratio(modes, conditionals, signals) for one in self._others]
+        log_ratio = log_sum(np.array(log_ratios)) - np.log(len(log_ratios))
         odds = _PRIOR / (1 - _PRIOR) * np.exp(min(log_ratio, 100.0))
         if odds > _LIMIT / (1 - _LIMIT):
             return (f'velocity: probability {odds / (1 + odds):.3g} that the user moves otherwise '
@@ -115,32 +125,6 @@ class MovementTest:
         return (log_sum(values) - np.log(values.size) + constant + float(rest)
                 + prior.log_evidence_of_aligned(aligned) - fit.log_evidence)
 
-    def _walks(self, walking: Likelihood, modes: Modes, conditionals: Sequence[Conditional],
-               signals: Signals) -> float:
-        """Return the log evidence of a user who walks, relative to that of the modes.
-
-        Each mode keeps its state of the surface.
-        """
-        prior, wide = self._likelihood.nuisance, walking.nuisance
-        n_moving, n_wide = prior.velocity.shape[1], wide.velocity.shape[1]
-        others = modes.values[:, n_moving:][:, ~prior.phases[:, n_moving:].any(axis=0)]
-        values = np.zeros((len(others), len(wide)))
-        values[:, :n_moving] = modes.values[:, :n_moving] * (
-            self._system.scenario.user_speed_std_mps / _WALKING_STD_MPS)
-        values[:, n_wide:n_wide + others.shape[1]] = others
-        starts = Starts(np.zeros(len(others), int), modes.points, values)
-        signals, mass = walking.signals(signals.received), modes.log_mass
-        states = [(self._refinement.same(conditionals[state]), modes.state == state)
-                  for state in np.unique(modes.state)]
-
-        def relative(climb: Callable[..., Modes]) -> float:
-            return log_sum(np.array([
-                climb(conditional, walking, select(starts, rows), signals).log_mass
-                for conditional, rows in states])) - mass
-        predicted = relative(lambda *args: one_step(*args)[0])
-        return predicted if predicted < _IMPROBABLE else relative(
-            functools.partial(ascend, n_steps=1))
-
     def _too_fast(self, fit: Fit) -> str:
         """Return the reason if residual and velocity are improbable together, or ''."""
         from scipy.special import chdtrc, ndtr
@@ -160,6 +144,64 @@ class MovementTest:
             f'velocity: {np.linalg.norm(speeds):.2g} standard deviations, with {residual:.3g} '
             f'times the expected residual energy: probability {probability:.1g}, expected at '
             f'least {_TOO_FAST:g}; the user may be faster than user_speed_std_mps')
+
+
+class _Others:
+    """Users with other velocities than declared, whose components have a standard deviation.
+
+    With `turns`, the direct path turns by 1 to `turns` further turns from one frame to the next,
+    in either direction, compared with a mode.
+    """
+
+    def __init__(self, system: System, declared: NuisancePrior, std_mps: float, turns: int = 0
+                 ) -> None:
+        scenario = system.scenario
+        self._declared, self._likelihood = declared, Likelihood(System(
+            dataclasses.replace(scenario, user_speed_std_mps=std_mps),
+            system.codebook, system.surface))
+        self._refinement = refinement_of(self._likelihood)
+        self._turns = turns
+        numbers = np.arange(-turns, turns + 1)
+        self._further_mps = numbers[(numbers != 0) | (turns == 0), None, None] * (
+            SPEED_OF_LIGHT_MPS / np.mean(scenario.center_frequencies_hz)
+            / scenario.frame_duration_s)
+
+    def log_ratio(self, modes: Modes, conditionals: Sequence[Conditional], signals: Signals
+                  ) -> float:
+        """Return the log evidence of such a user, relative to that of the modes of one shot.
+
+        Each mode keeps its state of the surface.
+        """
+        likelihood, prior = self._likelihood, self._declared
+        n_moving, n_wide = prior.velocity.shape[1], likelihood.nuisance.velocity.shape[1]
+        others = modes.values[:, n_moving:][:, ~prior.phases[:, n_moving:].any(axis=0)]
+        velocities, away = (
+            modes.values[:, :n_moving] @ prior.velocity.T, jacobian(modes.points)[:, :, 0])
+        if self._turns:
+            # The turns change the radial speed of each band by another value, for which a mode
+            # makes up by the speed across the line of sight. The ascent starts at half of it.
+            along = np.sum(velocities * away, axis=1)[:, None] * away
+            velocities = (velocities + along) / 2
+        velocities = velocities + self._further_mps * away
+        values = np.zeros((*velocities.shape[:2], len(likelihood.nuisance)))
+        values[..., :n_wide] = velocities @ np.linalg.pinv(likelihood.nuisance.velocity).T
+        values[..., n_wide:n_wide + others.shape[1]] = others
+        n = len(self._further_mps)
+        points, state = np.tile(modes.points, (n, 1)), np.tile(modes.state, n)
+        starts = Starts(np.zeros(len(points), int), points, values.reshape(len(points), -1))
+        signals, mass = likelihood.signals(signals.received), modes.log_mass
+        states = [(self._refinement.same(conditionals[one]), state == one)
+                  for one in np.unique(state)]
+
+        def relative(climb: Callable[..., Modes]) -> float:
+            return log_sum(np.array([
+                climb(conditional, likelihood, select(starts, rows), signals).log_mass
+                for conditional, rows in states])) - mass
+        if not self._turns:
+            predicted = relative(lambda *args: one_step(*args)[0])
+            if predicted < _IMPROBABLE:
+                return predicted
+        return relative(functools.partial(ascend, n_steps=_STEPS if self._turns else 1))
 
 
 def _frames(system: System) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

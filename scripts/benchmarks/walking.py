@@ -5,6 +5,8 @@ cycle, do their regions contain the truth, and how far is this from the exact po
 in random directions at given speeds. The deviation of velocities that the scenario declares is the
 same for all speeds. The exact posterior is that of many samples with the weights of the
 likelihood, around all modes of a search that also starts at the truth.
+
+With `--otherwise`, users are faster than declared, or walk although users at rest are declared.
 """
 
 import functools
@@ -30,7 +32,9 @@ from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.arguments import integer
 from rhs_isac_ros.system import System
 
-SPEEDS_MPS = 0.0, 0.1, 0.3, 1.0, 2.0
+# Systems and speeds [m/s]: users as declared, and those who move otherwise.
+SPEEDS_MPS = {'lab_walk_system': (0.0, 0.1, 0.3, 1.0, 2.0)}
+OTHERWISE_MPS = {'lab_walk_system': (5.0, 10.0), 'lab_system': (0.0, 0.03, 0.1, 0.3, 1.0)}
 # Users that are located at a time; samples of a mode of the exact posterior, and the factor of
 # their covariances.
 BLOCK, SAMPLES, WIDENING = 50, 1024, 1.3**2
@@ -41,36 +45,46 @@ def main() -> None:
     parser = frame.benchmark_parser('walking', __doc__, positions=1000, has_jobs=True)
     parser.add_argument('--exact', type=integer(0, 10**6), default=0, metavar='N',
                         help='users of each speed to compare with the exact posterior')
+    parser.add_argument('--otherwise', action='store_true',
+                        help='users who move otherwise than declared')
     options = parser.parse_args()
-    parts = {f'{speed:g} m/s, {first}': {
-        'speed_mps': speed, 'first': first, 'n': min(BLOCK, options.positions - first),
+    speeds_mps = OTHERWISE_MPS if options.otherwise else SPEEDS_MPS
+    parts = {f'{name}, {speed:g} m/s, {first}': {
+        'name': name, 'speed_mps': speed, 'first': first,
+        'n': min(BLOCK, options.positions - first),
         'n_exact': min(max(options.exact - first, 0), BLOCK), 'seed': options.seed}
-        for speed in SPEEDS_MPS for first in range(0, options.positions, BLOCK)}
+        for name, speeds in speeds_mps.items() for speed in speeds
+        for first in range(0, options.positions, BLOCK)}
     found = frame.measured(options, 'walking', errors, parts)
-    table = frame.Table(['speed [m/s]'], {
+    table = frame.Table(['system', 'speed [m/s]'], {
         'fix [%]': ('fix', 1), 'MSE [m²]': ('mse_m2', 3), 'in the region [%]': ('in_region', 1),
         'NEES / 3': ('nees', 2), 'velocity, rms [m/s]': ('velocity_rms_mps', 2),
         'velocity in its region [%]': ('velocity_in_region', 1),
         'both in theirs [%]': ('both_in_region', 1), 'MSE / exact': ('mse_ratio', 2)})
-    rows = {}
-    for speed in SPEEDS_MPS:
-        blocks = [found[name] for name, part in parts.items() if part['speed_mps'] == speed]
-        rows[f'{speed:g}'] = table.row(f'{speed:g}', **figures({
+    rows: dict[str, dict[str, Any]] = {name: {} for name in speeds_mps}
+    for name, speed in ((name, speed) for name, speeds in speeds_mps.items() for speed in speeds):
+        blocks = [found[one] for one, part in parts.items()
+                  if (part['name'], part['speed_mps']) == (name, speed)]
+        rows[name][f'{speed:g}'] = table.row(name, f'{speed:g}', **figures({
             key: np.concatenate([np.asarray(block[key]) for block in blocks])
             for key in blocks[0]}))
-    frame.write_results(options.json, {'lab': rows})
+    frame.write_results(options.json, rows if options.otherwise else {'lab': rows.popitem()[1]})
 
 
 @functools.cache
-def lab() -> tuple[System, BayesEstimator]:
-    """Return the system and its estimator."""
-    system = System.from_yaml(frame.CONFIG / 'lab_walk_system.yaml')
+def lab(name: str) -> tuple[System, BayesEstimator]:
+    """Return the system with a name and its estimator."""
+    system = System.from_yaml(frame.CONFIG / f'{name}.yaml')
     return system, BayesEstimator(system)
 
 
-def errors(speed_mps: float, first: int, n: int, n_exact: int, seed: int) -> Mapping[str, Any]:
-    """Locate users; return squared errors, plain and normalised, of those with a fix."""
-    system, estimator = lab()
+def errors(name: str, speed_mps: float, first: int, n: int, n_exact: int, seed: int
+           ) -> Mapping[str, Any]:
+    """Locate users; return squared errors, plain and normalised, of those with a fix.
+
+    Without a declared velocity, those of velocities are empty.
+    """
+    system, estimator = lab(name)
     rng = streams.generator(seed, streams.PHASES, first, round(1e3 * speed_mps))
     positions = system.scenario.sample_positions(n, rng)
     way = rng.standard_normal((n, 3))
@@ -83,12 +97,13 @@ def errors(speed_mps: float, first: int, n: int, n_exact: int, seed: int) -> Map
     exact = np.array([exact_mean(estimator, received[k], states[k]) for k in range(n_exact)])
     exact_squared = np.sum((exact.reshape(-1, 3) - positions[:n_exact])**2, axis=1)
     compared = fix[:n_exact]
+    moving = slice(None if system.scenario.user_speed_std_mps else 0)
     return {
         'fix': fix, 'squared': np.sum(whole[:, :3]**2, axis=1),
-        'velocity_squared': np.sum(whole[:, 3:]**2, axis=1),
+        'velocity_squared': np.sum(whole[moving, 3:]**2, axis=1),
         'normalised': normalised(whole[:, :3], joint[:, :3, :3]),
-        'velocity_normalised': normalised(whole[:, 3:], joint[:, 3:, 3:]),
-        'both_normalised': normalised(whole, joint),
+        'velocity_normalised': normalised(whole[moving, 3:], joint[moving, 3:, 3:]),
+        'both_normalised': normalised(whole[moving], joint[moving]),
         'exact_squared': exact_squared[compared],
         'compared': np.sum(whole[:np.count_nonzero(compared), :3]**2, axis=1)}
 
@@ -149,9 +164,10 @@ def figures(values: Mapping[str, np.ndarray]) -> dict[str, Any]:
         'mse_m2': frame.mean_interval(values['squared']),
         'nees': frame.mean_interval(values['normalised'] / 3),
         'velocity_rms_mps': root and tuple(one**0.5 for one in root),
-        **{f'{name}in_region': share_percent(
-            int(np.sum(values[f'{name}normalised'] <= limits[size])), n) if n else None
-           for name, size in (('', 3), ('velocity_', 3), ('both_', 6))},
+        **{f'{name}in_region': share_percent(int(np.sum(inside)), len(inside))
+           if len(inside) else None for name, inside in (
+               (name, values[f'{name}normalised'] <= limits[size])
+               for name, size in (('', 3), ('velocity_', 3), ('both_', 6)))},
         'mse_ratio': frame.mean_interval(
             values['compared'], relative_to=values['exact_squared'])}
 

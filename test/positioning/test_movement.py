@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from walking_users import WALKING, inside, system_of, users_of
 
+from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.positioning import BayesEstimator
 from rhs_isac_ros.positioning.estimate import Fit
 from rhs_isac_ros.positioning.likelihood import Likelihood
@@ -17,10 +18,18 @@ DECLARED = {
         'timing_std_s': 1e-7, 'user_gain_std_db': 2.0, 'element_error_rms': 0.05}}
 
 
+@pytest.fixture(scope='module')
+def walking():
+    system = system_of()
+    return system, BayesEstimator(system)
+
+
 @pytest.fixture(scope='module', params=[
     pytest.param(changes, id=name, marks=[] if name == 'walking' else pytest.mark.slow)
     for name, changes in DECLARED.items()])
 def declared(request):
+    if not request.param:
+        return request.getfixturevalue('walking')
     system = system_of(**request.param)
     return system, BayesEstimator(system)
 
@@ -48,6 +57,18 @@ def test_faster_users_have_no_fix_at_a_wrong_place(declared):
     wrong = np.count_nonzero(fix) * (1 - inside(errors, covariances, 2)) if fix.any() else 0
     assert wrong < 2.5
     assert all('user_speed_std_mps' in one or one.startswith('residual') for one in reasons if one)
+
+
+def test_users_whose_direct_path_turns_by_one_more_turn_in_a_frame_have_no_fix(walking):
+    system, estimator = walking
+    scenario, rng = system.scenario, np.random.default_rng(12)
+    states = users_of(scenario, 20, 0.5, rng)
+    away = states[:, :3] / np.linalg.norm(states[:, :3], axis=1, keepdims=True)
+    turn_mps = SPEED_OF_LIGHT_MPS / np.mean(scenario.center_frequencies_hz) / (
+        scenario.frame_duration_s)
+    states[1::2, 3:] += turn_mps * away[1::2]
+    estimate = estimator.estimate(system.sample(states, rng)[[13, 15, 17]])
+    assert all('moves otherwise' in reason for reason in estimate.reason)
 
 
 def test_independent_frames_contain_what_failed_elements_do():
