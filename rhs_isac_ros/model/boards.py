@@ -16,13 +16,21 @@ BUILT_IN: Mapping[str, Callable[..., Board]] = {
 
 
 def board_of(value: Any) -> Board:
-    """Return a board, from its name or a mapping of ``kind`` and the fields of this kind.
+    """Return a board, from its class, its name or a mapping of ``kind`` and fields of this kind.
 
     Names other than those of `BUILT_IN` are plug-ins: callables that take the fields and return a
     `Board`, or ``module:name`` of a subclass. Raises BoardError if the value does not describe a
     board.
     """
+    if isinstance(value, type) and issubclass(value, Board):
+        value = value()
     if isinstance(value, Board):
+        name = value.plain if isinstance(value.plain, str) else value.plain['kind']
+        if name not in plugins.LOADED and BUILT_IN.get(name) is not type(value):
+            if name in BUILT_IN:
+                raise BoardError(f'{type(value).__name__}: kind {name!r}, expected another one '
+                                 'than that of a built-in board')
+            plugins.GIVEN[name] = type(value)
         return value
     fields = {'kind': value} if isinstance(value, str) else value
     if not isinstance(fields, Mapping) or not isinstance(kind := fields.get('kind'), str):

@@ -8,6 +8,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from rhs_isac_ros.support import plugins
+
 
 class External(abc.ABC):
     """A scenario value from a file or plug-in; two of a class are equal if their digests are."""
@@ -25,8 +27,11 @@ class External(abc.ABC):
     def named(cls, text: str) -> 'External':
         """Load a value by its origin, which may be followed by ``@`` and the expected digest.
 
+        A value without an origin is one of this process, or of the process that runs the job.
         Raises ValueError if there is no valid value or the digest differs.
         """
+        if isinstance(held := plugins.GIVEN.get(text, plugins.HELD.get(text)), cls):
+            return held
         origin, expected = re.fullmatch(  # type: ignore[union-attr]
             r'(.*?)(?:@([0-9a-f]{16}))?', text, re.DOTALL).groups()
         if not origin:
@@ -42,6 +47,12 @@ class External(abc.ABC):
     def digest(self) -> str:
         """16 hexadecimal digits that identify the content in all processes."""
         raise NotImplementedError
+
+    def held(self) -> 'External':
+        """Return the value, which `named` finds by its text while it is in use."""
+        if not self.origin:
+            plugins.HELD[str(self)] = self
+        return self
 
     def __str__(self) -> str:
         """Return the origin and the digest in the form that `named` reads."""

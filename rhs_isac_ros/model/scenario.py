@@ -366,7 +366,7 @@ class Scenario(Extensions, Table1):
 
         Gain patterns are written as name and digest, and files as path and digest. Given the
         `folder` of a scenario file, paths are relative to it. A pattern that is not a plug-in
-        cannot be read back, and neither can arrays that are not in a file.
+        can be read back only in this process and its jobs, as can arrays that are not in a file.
         """
         changes = {field.name: as_plain(value) for field in dataclasses.fields(self)
                    if (value := getattr(self, field.name)) != field.default}
@@ -545,12 +545,12 @@ def _number(field: dataclasses.Field[Any], value: Any) -> Any:
 
 def _external(field: dataclasses.Field[Any], value: Any, kind: type[External]) -> Any:
     if isinstance(value, kind) or value is None and field.default is None:
-        return value
+        return value and value.held()
     with translated(ValueError, ScenarioError, field.name):
         if isinstance(value, str | Path):
             return kind.named(str(value))
         if kind is GainPattern and callable(value):
-            return GainPattern(value)
+            return GainPattern(value).held()
     raise ScenarioError(f'{field.name}: {value!r}, expected {kind.WORDS[1]}')
 
 

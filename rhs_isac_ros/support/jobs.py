@@ -86,7 +86,7 @@ def sources_of(*uses: Any) -> str:
         texts.append(_definition(one if is_plain else type(one), set()))
         while isinstance(one, functools.partial):
             one = one.func
-        module = sys.modules.get(one.__module__)
+        module = sys.modules.get(getattr(one, '__module__', ''))
         named = vars(module).values() if module else ()
         modules = [module, *(
             value if inspect.ismodule(value) else
@@ -407,7 +407,8 @@ class _State:
     def _admitted(self, function: Function, job: Job) -> _Entry:
         """Return a job, which is ready to run if it is new and has no stored result."""
         text = json.dumps(job.arguments)
-        used = {name: plugin for name, plugin in (plugins.LOADED | plugins.GIVEN).items()
+        given = {**plugins.GIVEN, **dict(plugins.HELD.items())}
+        used = {name: plugin for name, plugin in (plugins.LOADED | given).items()
                 if json.dumps(name) in text}
         if (key := (id(function), *used)) not in self._sources:
             self._sources[key] = sources_of(function, *used.values())
@@ -417,7 +418,7 @@ class _State:
                 raise ValueError(f'jobs: two have the name {job.name}, expected unique names')
             return known
         entry = self._entries[job.name] = _Entry(function, job, record, {
-            name: plugin for name, plugin in used.items() if name in plugins.GIVEN})
+            name: plugin for name, plugin in used.items() if name in given})
         if self._folder:
             self._files.add(file := _file(self._folder, job))
             entry.result = _stored(file, record)

@@ -5,6 +5,7 @@ in place of a name also has such a name, under which this process finds it again
 """
 
 import sys
+import weakref
 from importlib import import_module, metadata
 from operator import attrgetter
 from typing import Any
@@ -40,6 +41,8 @@ def describe(group: str, name: Any) -> str:
 #: Objects that callers have given in place of names, by ``module:name``; loaded ones by name.
 GIVEN: dict[str, Any] = {}
 LOADED: dict[str, Any] = {}
+#: Objects without a name that scenarios of this process contain, by their texts.
+HELD: weakref.WeakValueDictionary[str, Any] = weakref.WeakValueDictionary()
 
 
 def is_reference(name: Any) -> bool:

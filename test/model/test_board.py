@@ -168,6 +168,7 @@ def test_a_focused_beam_is_in_phase_at_its_point(kind):
 
 @pytest.mark.parametrize(('changes', 'expected'), [
     ({'board': 3}, "3, expected the name of a board, or a mapping with kind"),
+    ({'board': type('Own', (Paper,), {})}, "Own: kind 'paper', expected another one than that of"),
     ({'board': {'loss_db_per_m': 1}}, 'expected the name of a board, or a mapping with kind'),
     ({'board': 'mirror'}, "'mirror', expected a plug-in of rhs_isac_ros.boards"),
     ({'board': {'kind': 'phase', 'range': 1}}, "range: unknown field of 'phase', expected one of"),
