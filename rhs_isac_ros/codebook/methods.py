@@ -58,7 +58,7 @@ def run_lbfgs(
     from scipy.optimize import minimize
 
     # SciPy multiplies the corrections with a BLAS library of its own.
-    one_blas_thread.find_libraries()
+    one_blas_thread.find_scipy()
     unit = 0.0
 
     def relative(variables: np.ndarray) -> tuple[float, np.ndarray]:
@@ -267,7 +267,7 @@ def minimize_interior_point(
     from scipy.optimize import BFGS, Bounds, minimize
 
     # SciPy multiplies the Hessian matrix with a BLAS library of its own.
-    one_blas_thread.find_libraries()
+    one_blas_thread.find_scipy()
     best = search.value_and_gradient(start)[0], np.array(start)
     scale = best[0]
 

@@ -8,9 +8,6 @@ tunings are discrete, they are then exchanged as long as this increases the capa
 """
 
 import dataclasses
-import functools
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -36,6 +33,9 @@ _MIN_GAIN = 1e-9
 def tuned_beam(scenario: Scenario, position: np.ndarray, band: int,
                surface: SurfaceEstimate | None) -> Beamformer:
     """Find a beam that nearly maximises Eq. (10) for a user at a position, float64 [3] [m]."""
+    from scipy.optimize import minimize
+
+    one_blas_thread.find_scipy()
     whole = TunedLink.to(scenario, position, band, surface)
     link = whole.at_subbands(representative_subbands(scenario, _MAX_DRIFT_RAD, _MAX_SUBBANDS))
     try:
@@ -48,19 +48,10 @@ def tuned_beam(scenario: Scenario, position: np.ndarray, band: int,
         rate, gradient = link.rate_and_gradient(tunings)
         return -rate, -gradient
 
-    end = _minimize()(loss, start, jac=True, method='L-BFGS-B', bounds=[(0.0, 1.0)] * len(start),
+    end = minimize(loss, start, jac=True, method='L-BFGS-B', bounds=[(0.0, 1.0)] * len(start),
                    options={'maxiter': _N_STEPS}).x
     best = link.exchanged(on_levels(scenario, end), scenario.amplitude_levels)
     return Beamformer(best, whole.best_digital(best), band)
-
-
-@functools.cache
-def _minimize() -> Callable[..., Any]:
-    """Return SciPy's function, whose first import loads a BLAS of its own."""
-    from scipy.optimize import minimize
-
-    one_blas_thread.find_libraries()
-    return minimize
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

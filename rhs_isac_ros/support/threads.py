@@ -38,6 +38,7 @@ class _OneBlasThread(contextlib.ContextDecorator):
         self._shared: list[_Library] = []
         self._per_thread: list[_Library] = []
         self._saved: list[tuple[_Library, int]] = []
+        self._has_scipy = False
         self.find_libraries()
 
     def __enter__(self) -> None:
@@ -83,7 +84,7 @@ class _OneBlasThread(contextlib.ContextDecorator):
 
         The search holds the lock of the dynamic loader and needs the lock of the interpreter, so
         it would deadlock with a thread that is importing an extension module. It therefore runs
-        while this module is imported, and later only in functions that load SciPy's own BLAS.
+        while this module is imported, and later only in `find_scipy`.
         """
         found = ThreadpoolController().select(user_api='blas').lib_controllers
         per_thread = [library for library in found
@@ -93,6 +94,12 @@ class _OneBlasThread(contextlib.ContextDecorator):
             self._shared = [library for library in found if library not in per_thread]
             if self._depth:
                 self._saved += _limit(self._shared)
+
+    def find_scipy(self) -> None:
+        """Find SciPy's own BLAS, which the caller has loaded; a search takes milliseconds."""
+        if not self._has_scipy:
+            self.find_libraries()
+            self._has_scipy = True
 
 
 def _limit(libraries: Iterable[_Library]) -> list[tuple[_Library, int]]:

@@ -134,8 +134,8 @@ def test_methods_of_scipy_run_its_blas_with_one_thread(
         seen.append({library.get_num_threads() for library in libraries})
 
     # A process that has not imported SciPy yet.
-    for name in ('_shared', '_per_thread'):
-        monkeypatch.setattr(threads.one_blas_thread, name, [])
+    for name, value in {'_shared': [], '_per_thread': [], '_has_scipy': False}.items():
+        monkeypatch.setattr(threads.one_blas_thread, name, value)
     with threadpool_limits(3, user_api='blas'):
         for library in ThreadpoolController().select(user_api='blas').lib_controllers:
             getattr(library, 'clear_controlling_thread', lambda: None)()
