@@ -86,6 +86,9 @@ def sources_of(*uses: Any) -> str:
         texts.append(_definition(one if is_plain else type(one), set()))
         while isinstance(one, functools.partial):
             one = one.func
+        # If a module is loaded again, files are read again only if this code differs.
+        texts += [_definition(member.__code__, set()) for member in (
+            vars(one).values() if isinstance(one, type) else [one]) if inspect.isfunction(member)]
         module = sys.modules.get(getattr(one, '__module__', ''))
         named = vars(module).values() if module else ()
         modules = [module, *(
@@ -166,7 +169,7 @@ def attempt(function: Function, job: Job,
 
     `given` are objects of the process that wants the result, to which names of plug-ins refer.
     """
-    plugins.GIVEN.update(given)
+    plugins.GIVEN.update((name, one) for name, one in given.items() if name not in plugins.HELD)
     try:
         result = function(**job.arguments)
         if not isinstance(result, Mapping):
@@ -286,7 +289,7 @@ class Workers:
                 entry = running.pop(future)
                 state.take(entry, self._result(entry.job, future))
                 if show:
-                    show(state.n_done, '', state.n_jobs)
+                    show(state.n_done, '', len(state.entries))
             return [state.ends[number] for number in range(len(strands))]
 
     @contextlib.contextmanager
@@ -361,7 +364,7 @@ class _State:
         self.ends: dict[int, Any] = {}
         self.n_done = 0
         self._strands, self._folder, self._files = strands, workers.folder, workers.files
-        self._entries: dict[str, _Entry] = {}
+        self.entries: dict[str, _Entry] = {}
         # By the identity of a function, which an entry keeps, and the names of plug-ins.
         self._sources: dict[tuple[Any, ...], str] = {}
         # The jobs that each strand waits for, and the number of those without a result.
@@ -369,11 +372,6 @@ class _State:
         self._n_missing: dict[int, int] = {}
         for number in range(len(strands)):
             self._advance(number, None)
-
-    @property
-    def n_jobs(self) -> int:
-        """The number of jobs so far."""
-        return len(self._entries)
 
     def take(self, entry: _Entry, result: dict[str, Any]) -> None:
         """Keep the result of a job, and advance each strand that has waited only for this one."""
@@ -413,11 +411,11 @@ class _State:
         if (key := (id(function), *used)) not in self._sources:
             self._sources[key] = sources_of(function, *used.values())
         record = {'sources': self._sources[key], 'arguments': dict(job.arguments)}
-        if known := self._entries.get(job.name):
+        if known := self.entries.get(job.name):
             if _as_text(known.record) != _as_text(record):
                 raise ValueError(f'jobs: two have the name {job.name}, expected unique names')
             return known
-        entry = self._entries[job.name] = _Entry(function, job, record, {
+        entry = self.entries[job.name] = _Entry(function, job, record, {
             name: plugin for name, plugin in used.items() if name in given})
         if self._folder:
             self._files.add(file := _file(self._folder, job))

@@ -167,13 +167,12 @@ def test_a_plugin_that_an_argument_names_is_a_source(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
 
     def work(estimator):
-        return {'n': load(ESTIMATORS, estimator).n}
+        return {'n': load(ESTIMATORS, estimator)().n()}
     found = []
     for text in ('1', '2'):
-        (tmp_path / 'my_lab.py').write_text(f'class Grid:\n    n = {text}\n')
+        (tmp_path / 'my_lab.py').write_text(f'class Grid:\n    def n(self): return {text}\n')
         monkeypatch.delitem(sys.modules, 'my_lab', raising=False)
         importlib.invalidate_caches()
-        jobs_module._digest.cache_clear()
         load(ESTIMATORS, 'my_lab:Grid')
         found += run_jobs(
             work, [Job('a', {'estimator': 'my_lab:Grid'})], tmp_path / 'kept', n_jobs=1)
