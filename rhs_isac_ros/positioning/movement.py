@@ -27,7 +27,12 @@ import numpy as np
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.arrays import log_sum
 from rhs_isac_ros.model.constants import POWER_NEPERS_PER_DB
-from rhs_isac_ros.model.geometry import jacobian, stands_still, velocity_std_mps
+from rhs_isac_ros.model.geometry import (
+    frame_times_s,
+    jacobian,
+    stands_still,
+    velocity_std_mps,
+)
 from rhs_isac_ros.positioning.estimate import Fit
 from rhs_isac_ros.positioning.failures import refinement_of
 from rhs_isac_ros.positioning.grid import Starts
@@ -44,8 +49,9 @@ _WALKING_MPS = 1.5
 # Standard deviations of each component of velocities: of users who move slowly or walk [m/s], and
 # of those who are faster than declared, relative to the declared one.
 _SLOW_STD_MPS, _FASTER = (0.1, 1.0), 4.0
-# Largest numbers of turns and of steps to a mode for users who are faster than declared.
-_TURNS, _STEPS = 2, 6
+# Largest numbers of turns and of steps to a mode for users who are faster than declared, and the
+# share of a speed across the line of sight that is too large.
+_TURNS, _STEPS, _ACROSS = 2, 6, 0.5
 # Prior probability that a user moves otherwise, and largest probability with a fix: above it, a
 # 95 % region cannot attain its coverage.
 _PRIOR, _LIMIT = 0.03, 0.05
@@ -162,9 +168,15 @@ class _Others:
         self._refinement = refinement_of(self._likelihood)
         self._turns = turns
         numbers = np.arange(-turns, turns + 1)
-        self._further_mps = numbers[(numbers != 0) | (turns == 0), None, None] * (
-            SPEED_OF_LIGHT_MPS / np.mean(scenario.center_frequencies_hz)
-            / scenario.frame_duration_s)
+        numbers = numbers[(numbers != 0) | (turns == 0), None, None]
+        frequencies_hz, times_s = np.array(scenario.center_frequencies_hz), frame_times_s(scenario)
+        self._further_mps = numbers * SPEED_OF_LIGHT_MPS / (
+            frequencies_hz.mean() * scenario.frame_duration_s)
+        # A turn is less speed in a band of a higher frequency. If such bands come later, a mode
+        # that lacks turns away from the surface makes up for the difference by the growth of the
+        # range with the square of the time: the speed across the line of sight is too large.
+        rise = (frequencies_hz - frequencies_hz.mean()) @ times_s.mean(axis=1)
+        self._across = np.where(numbers * rise > 0, _ACROSS, 1.0)
 
     def log_ratio(self, modes: Modes, conditionals: Sequence[Conditional], signals: Signals
                   ) -> float:
@@ -177,12 +189,8 @@ class _Others:
         others = modes.values[:, n_moving:][:, ~prior.phases[:, n_moving:].any(axis=0)]
         velocities, away = (
             modes.values[:, :n_moving] @ prior.velocity.T, jacobian(modes.points)[:, :, 0])
-        if self._turns:
-            # The turns change the radial speed of each band by another value, for which a mode
-            # makes up by the speed across the line of sight. The ascent starts at half of it.
-            along = np.sum(velocities * away, axis=1)[:, None] * away
-            velocities = (velocities + along) / 2
-        velocities = velocities + self._further_mps * away
+        along = np.sum(velocities * away, axis=1)[:, None] * away
+        velocities = along + self._across * (velocities - along) + self._further_mps * away
         values = np.zeros((*velocities.shape[:2], len(likelihood.nuisance)))
         values[..., :n_wide] = velocities @ np.linalg.pinv(likelihood.nuisance.velocity).T
         values[..., n_wide:n_wide + others.shape[1]] = others
