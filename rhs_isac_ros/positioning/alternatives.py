@@ -21,7 +21,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import blocks, marked
+from rhs_isac_ros.model.arrays import blocks, log_sum, marked
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_bessel, log_evidence_of_level
 from rhs_isac_ros.model.geometry import element_positions, to_positions
@@ -37,6 +37,7 @@ from rhs_isac_ros.positioning.projection import (
     white_means,
 )
 from rhs_isac_ros.positioning.segments import Segments, select
+from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.support.threads import map_blocks
 
 # Above this probability, a position is less probable than its alternatives.
@@ -87,6 +88,10 @@ class OutsideGrid(NamedTuple):
     shots: int = 16
     # Number of places to which sets of failed elements are fitted.
     places: int = 24
+    # Sheets around places: numbers before and after a merger, and squared distance within one.
+    cells: int = 128
+    sheets: int = 16
+    apart: float = 3.0
 
 
 GRID = OutsideGrid()
@@ -267,8 +272,20 @@ class Outside:
         Returns points (r [m], u, v), [P, 3], parameters that fit there, [P, Q], and the factor of
         the signals that is not a parameter.
         """
-        best = max(self._templates, key=lambda one: one.log_evidence_of(whitened[None], prior)[0])
-        return *best.places(whitened, prior), 1.0
+        return *self._best(whitened, prior).places(whitened, prior), 1.0
+
+    def sheets(self, whitened: np.ndarray, prior: NuisancePrior) -> Sheets:
+        """Return the heaviest parts of the posterior of the position of a user outside.
+
+        Takes whitened signals of one shot. The mass of the density is the share of these parts.
+        """
+        return self._best(whitened, prior).sheets(whitened, prior)
+
+    def _best(self, whitened: np.ndarray, prior: NuisancePrior) -> '_Templates':
+        """Return the templates of the most likely state of the surface for one shot."""
+        if len(self._templates) == 1:
+            return self._templates[0]
+        return max(self._templates, key=lambda one: one.log_evidence_of(whitened[None], prior)[0])
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether some position explains the signals up to this residual energy."""
@@ -284,6 +301,7 @@ class _Templates:
         self._filters, self._index = arrays['outer_filters'], arrays['outer_index']
         ranges = _ranges(scenario)[:, None]
         self._directions, self._carriers = _directions(scenario), carrier_wavenumbers(scenario)
+        self._spacing = [np.diff(np.unique(axis)).min() for axis in self._directions.T]
         self._scale = (2 / ranges).astype(np.float32)
         energy = arrays['outer_energy']
         if state.operator is not None:
@@ -307,8 +325,19 @@ class _Templates:
                                for block in blocks(len(whitened), GRID.shots)])
 
     def _log_evidence(self, whitened: np.ndarray, prior: NuisancePrior) -> np.ndarray:
+        shot, _, _, logs, largest = self._cells(whitened, prior)
+        with np.errstate(divide='ignore'):
+            return self._state.offset + largest + np.log(
+                np.bincount(shot, np.exp(logs - largest[shot]), minlength=len(whitened))
+            ) - (not prior.gain_std) * self._state.energy(whitened)
+
+    def _cells(self, whitened: np.ndarray, prior: NuisancePrior) -> tuple[np.ndarray, ...]:
+        """Return shots, ranges, directions and log evidences of cells, [C], and the largest, [N].
+
+        The evidences lack the energies if the gain is known. Cells without a share are left out.
+        """
         filtered, energy = self._filter(whitened), self._state.energy(whitened)
-        n_shots, n = len(whitened), whitened[0].size
+        n = whitened[0].size
         # At any range, the log-likelihood is highest if the outputs of all bands are in phase.
         explained = (np.sum(filtered, axis=1)**2 / self._node_energy).max(axis=1)
         rest = np.maximum(energy[:, None] - explained, n * _MIN_PROBABILITY)
@@ -336,7 +365,8 @@ class _Templates:
         least = largest - GRID.margin - n_bands * (mean - log_bessel(mean))
         (chosen,) = (highest >= of_shot.repeat(least)).ravel().nonzero()
         arguments = arguments.reshape(n_bands, -1).take(chosen, axis=1)
-        shot = shot[chosen % len(shot)]
+        ranges, pairs = np.divmod(chosen, len(shot))
+        shot, direction = shot[pairs], direction[pairs]
         logs = value.take(chosen) + offset.take(chosen).astype(float) + np.sum(
             log_bessel(arguments) - arguments, axis=0)
         if prior.gain_std:
@@ -344,10 +374,7 @@ class _Templates:
             power = np.exp(-2 * gain.take(chosen)) * energy[shot]
             logs -= np.log(4 * power - total.take(chosen) + prior.gain_std**-2) / 2 + math.log(
                 prior.gain_unit)
-        with np.errstate(divide='ignore'):
-            return self._state.offset + largest + np.log(
-                np.bincount(shot, np.exp(logs - largest[shot]), minlength=n_shots)
-            ) - (not prior.gain_std) * energy
+        return shot, ranges, direction, logs, largest
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether some position explains the signals up to this residual energy."""
@@ -381,6 +408,17 @@ class _Templates:
         order = np.argsort(-value, kind='stable')
         order = order[separate(np.zeros(len(order), int), points[order], radii)][:GRID.places]
         return points[order], values[order]
+
+    def sheets(self, whitened: np.ndarray, prior: NuisancePrior) -> Sheets:
+        """Merge the cells of the grid with the most mass; see `Outside.sheets`."""
+        _, ranges, directions, logs, _ = self._cells(whitened[None], prior)
+        chosen = np.argsort(-logs, kind='stable')[:GRID.cells]
+        range_m = 2 / self._scale[ranges[chosen], 0].astype(float)
+        extents = np.empty((len(chosen), 3))
+        extents[:, 0], extents[:, 1:] = range_m * math.log(GRID.range_ratio), self._spacing
+        points = np.column_stack([range_m, self._directions[directions[chosen]]])
+        return Sheets._make((logs[chosen] - log_sum(logs), points, extents[:, None]**2 / 12
+                             * np.eye(3))).reduce(GRID.sheets, GRID.apart)
 
     def _filter(self, whitened: np.ndarray) -> np.ndarray:
         """Return filter output magnitudes by template and direction, [N, N_B, T, V] [m]."""
@@ -495,12 +533,17 @@ def _best_gain(prior: NuisancePrior, amplitude: np.ndarray, energy: np.ndarray, 
     return value if prior.gain_std else value - energy, gain
 
 
+def farthest_range_m(scenario: Scenario) -> float:
+    """Return the largest range of users outside."""
+    return GRID.range_factor * float(Resolution.of(scenario).farthest_m)
+
+
 def _ranges(scenario: Scenario) -> np.ndarray:
     """Return the ranges of the grid in geometric progression, float64 [R] [m]."""
     resolution = Resolution.of(scenario)
     aperture_m = np.linalg.norm(element_positions(scenario), axis=1).max()
     nearest_m = max(GRID.nearest * resolution.nearest_m, GRID.apertures * aperture_m)
-    ratio = GRID.range_factor * resolution.farthest_m / nearest_m
+    ratio = farthest_range_m(scenario) / nearest_m
     n_ranges = 1 + max(1, int(np.ceil(np.log(ratio) / np.log(GRID.range_ratio))))
     return nearest_m * GRID.range_ratio**np.arange(n_ranges)
 

@@ -30,6 +30,19 @@ class SignalError(ValueError):
     """Received signals cannot be used: wrong type or shape, not finite, or too large."""
 
 
+class Places(NamedTuple):
+    """The likelihood of positions outside of the region, relative to the average inside.
+
+    It is a sum of Gaussians and a constant. Those of positions inside, which may be outside of the
+    region of a site, are part of the sum.
+    """
+
+    likelihood: Mixture  # In the frame of the site, D = 3; log-weights are those of integrals.
+    log_rest: float  # Logarithm of the constant.
+    # Largest range of positions, whose prior is uniform in range and solid angle [m].
+    farthest_m: float
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sighting:
     """What the signals of one surface say about a position, for a user in the region.
@@ -51,6 +64,8 @@ class Sighting:
     outside_log_ratio: float = np.nan
     blocked_log_ratio: float = np.nan
     misfit_log_ratio: float = np.nan
+    #: Where a user outside may be; None if all places are equally likely.
+    places: Places | None = None
 
     def __post_init__(self) -> None:
         """Check the probability."""
@@ -66,7 +81,10 @@ class Sighting:
         """Return what the same signals say if the surface has another pose."""
         if pose == self.pose:
             return self
-        return dataclasses.replace(self, pose=pose, mixture=self.mixture.moved(self.pose, pose))
+        places = self.places and self.places._replace(
+            likelihood=self.places.likelihood.moved(self.pose, pose))
+        return dataclasses.replace(self, pose=pose, places=places,
+                                   mixture=self.mixture.moved(self.pose, pose))
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

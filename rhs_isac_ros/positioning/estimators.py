@@ -20,6 +20,7 @@ from rhs_isac_ros.positioning.alternatives import (
     log_ratios_of,
     rejection,
 )
+from rhs_isac_ros.positioning.beyond import places_of
 from rhs_isac_ros.positioning.diagnosis import FitTest, misfit_log_ratio
 from rhs_isac_ros.positioning.draws import DrawnPosterior
 from rhs_isac_ros.positioning.estimate import (
@@ -32,12 +33,10 @@ from rhs_isac_ros.positioning.estimate import (
     regular,
 )
 from rhs_isac_ros.positioning.failures import refinement_of
-from rhs_isac_ros.positioning.grid import TemplateTable
-from rhs_isac_ros.positioning.lattice import Grid, lay_grid
+from rhs_isac_ros.positioning.lattice import lay_grid
 from rhs_isac_ros.positioning.likelihood import Conditional, Likelihood, Signals
 from rhs_isac_ros.positioning.mixture import Mixture
 from rhs_isac_ros.positioning.movement import MovementTest
-from rhs_isac_ros.positioning.moving import MovingTable
 from rhs_isac_ros.positioning.offsets import Alignment
 from rhs_isac_ros.positioning.posterior import (
     BandPhases,
@@ -59,6 +58,7 @@ from rhs_isac_ros.positioning.prior import (
     multiply,
     uniform,
 )
+from rhs_isac_ros.positioning.scope import SearchScope
 from rhs_isac_ros.positioning.search import GRID_MARGIN, Modes, OneState, likely_modes, modes_from
 from rhs_isac_ros.positioning.segments import Segments, concatenate, select
 from rhs_isac_ros.positioning.sheets import Sheets
@@ -90,26 +90,6 @@ class _Limits(NamedTuple):
 
 
 _LIMITS = _Limits()
-
-
-class SearchScope(NamedTuple):
-    """Where modes are searched for, and what depends on the templates there."""
-
-    table: TemplateTable
-    alignment: Alignment
-    alternatives: Sequence[Alternative]
-    #: Cells in which less likely modes are kept as well, bool [C] or [1].
-    favoured: np.ndarray
-    drawn: DrawnPosterior | None = None
-
-    @classmethod
-    def of(cls, likelihood: Likelihood, arrays: Mapping[str, np.ndarray], grid: Grid,
-           alternatives: Sequence[Alternative]) -> 'SearchScope':
-        """Take the templates of a grid, which may be part of the region's."""
-        scenario = likelihood.scenario
-        kind = MovingTable if scenario.user_speed_std_mps else TemplateTable
-        table = kind(scenario, arrays, grid=grid)
-        return cls(table, Alignment(likelihood, table.spread), alternatives, np.zeros(1, bool))
 
 
 class SearchEstimator(abc.ABC):
@@ -367,14 +347,14 @@ class SearchEstimator(abc.ABC):
             seen = whitened
             for alternative in scope.alternatives:
                 seen = alternative.seen(self._likelihood.model, signals.received, seen)
-            ratios = self._log_ratios(
+            ratios, outside = self._log_ratios(
                 scope.alternatives, signals, seen, aligned, [one.fit for one in fits])
             for n, (row, searched, one, values) in enumerate(zip(
                     usable, fits, seen, aligned, strict=True)):
                 log_ratios = {name: float(ratio[n]) for name, ratio in ratios.items()}
                 estimate = self._judge(
                     scope.alternatives, log_ratios, searched, select(signals, [n]), one, values)
-                found[row] = _Found(self, estimate, log_ratios, *searched)
+                found[row] = _Found(self, estimate, log_ratios, *searched, outside[n])
         return found
 
     def _fits(self, scope: SearchScope, signals: Signals, aligned: np.ndarray,
@@ -456,12 +436,15 @@ class SearchEstimator(abc.ABC):
             positions, log_weights, modes.shots, (2 * n_moving + 2) * (n_moving > 0))
 
     def _log_ratios(self, alternatives: Sequence[Alternative], signals: Signals, seen: np.ndarray,
-                    aligned: np.ndarray, fits: Sequence[Fit]) -> dict[str, np.ndarray]:
+                    aligned: np.ndarray, fits: Sequence[Fit]
+                    ) -> tuple[dict[str, np.ndarray], list[Callable[[], Sheets] | None]]:
         """Return logarithms of the likelihoods of alternatives relative to the fits, [N] each.
 
-        Where averages over all surfaces leave a doubt, each has the failures found for it.
+        Where averages over all surfaces leave a doubt, each has the failures found for it. Also
+        returns functions that compute the density of each user outside.
         """
         prior, found = self._likelihood.nuisance, {}
+        outside: list[Callable[[], Sheets] | None] = [None] * len(fits)
         residuals, averaged, gains = np.array([
             (fit.residual, fit.averaged_evidence, fit.log_evidence - fit.averaged_evidence)
             for fit in fits]).T
@@ -474,7 +457,9 @@ class SearchEstimator(abc.ABC):
                 ratios[n] += self._refinement.gain(points, parameters + values[n], Signals(*(
                     each / level for each in select(signals, [n])))) - gains[n]
             found[one.name] = ratios
-        return found
+            if isinstance(one, Outside):
+                outside = [functools.partial(one.sheets, each, prior) for each in seen]
+        return found, outside
 
     def _judge(self, alternatives: Sequence[Alternative], log_ratios: Mapping[str, float],
                searched: '_Searched', signals: Signals, whitened: np.ndarray, aligned: np.ndarray
@@ -571,6 +556,8 @@ class _Found(NamedTuple):
     # Those of `_Searched`.
     modes: Modes | None = None
     conditionals: Sequence[Conditional] = ()
+    # Returns the density of a user outside, if it is known.
+    outside: Callable[[], Sheets] | None = None
 
     def posterior(self) -> Estimate:
         """Return the estimate with its mixture and its sighting."""
@@ -593,8 +580,13 @@ class _Found(NamedTuple):
         log_evidence = fit.log_evidence + float(np.log(size[size > 0]).sum())
         blocked = float(np.nan_to_num(estimate.blocked_probability))
         pose = estimator.scenario.pose
+        placed = mixture.scaled(estimator._scale(fit)).moved(Pose(), pose)
+        log_ratio = self.log_ratios.get(Outside.name, -np.inf)
+        places = places_of(self.outside(), log_ratio, estimator.scenario, placed
+                           ) if self.outside and size.all() and np.isfinite(log_ratio) else None
         return Sighting(
-            pose, mixture.scaled(estimator._scale(fit)).moved(Pose(), pose).weighted(log_evidence),
+            pose, placed.weighted(log_evidence),
             float(np.clip(blocked + (1 - blocked) * MISS_PROBABILITY, 0.0, 1 - 1e-12)), sheets,
             misfit_log_ratio=misfit_log_ratio(fit.residual, estimator._n_measurements),
+            places=places,
             **{f'{name}_log_ratio': value for name, value in self.log_ratios.items()})

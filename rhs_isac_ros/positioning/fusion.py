@@ -16,8 +16,8 @@ have missed a mode, or the surface may be elsewhere. A surface that disagrees wi
 makes the posterior broader. All masses are averages over the region, in all of its dimensions.
 
 All surfaces together decide whether a user is outside of the region. The product for a user inside
-is compared with the product of what each surface says about a user outside. A surface may see the
-user beyond its own region, or in the part of it that is outside of the region of the site.
+is compared with that for a user outside; see `beyond`. A surface may see the user beyond its own
+region, or in the part of it that is outside of the region of the site.
 """
 
 import functools
@@ -32,6 +32,7 @@ from rhs_isac_ros.model.gaussian import likelihood_loss, moments, step_to_maximu
 from rhs_isac_ros.model.geometry import jacobian, polar_derivative, to_polar, to_positions
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.alternatives import Outside, log_odds_of, rejection
+from rhs_isac_ros.positioning.beyond import log_evidence
 from rhs_isac_ros.positioning.estimate import SITE, Estimate, Sighting, regular
 from rhs_isac_ros.positioning.mixture import Mixture, log_volume, velocity_variance
 from rhs_isac_ros.positioning.segments import concatenate, select
@@ -138,10 +139,8 @@ class Fuser:
         log_ratios = np.array([one.outside_log_ratio for one in sightings])
         if self._outside_probability and not np.isnan(log_ratios).all():
             log_missing = np.log([one.missing for one in sightings])
-            beyond = np.maximum(-np.expm1([one.log_share for one in factors]), 1e-9)
-            # Beyond the region of the surface, or in the part of it outside of that of the site.
-            log_outside = np.logaddexp(log_missing, np.log1p(-np.exp(log_missing)) + np.logaddexp(
-                np.nan_to_num(log_ratios), np.log(beyond))).sum()
+            log_outside = log_evidence(
+                sightings, [one.log_share for one in factors], self._bounds_m)
             # A user inside, too, may be seen by no surface.
             log_inside = np.logaddexp(log_agreement, log_missing.sum())
             probability = float(np.exp(-np.logaddexp(

@@ -1,0 +1,142 @@
+"""The evidence of several surfaces for a user outside of the region of a site.
+
+For each surface, the likelihood of a position outside is a sum of Gaussians and a constant, like
+that of a position inside: see `Places`. The evidence is the average of the product of these sums
+over one prior of the places outside. So surfaces that see the user at different places outside do
+not agree on a user outside. Of a surface that says no more than whether the user is outside, the
+likelihood is a constant.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rhs_isac_ros.model.geometry import to_polar
+from rhs_isac_ros.model.pose import Pose
+from rhs_isac_ros.model.scenario import Scenario
+from rhs_isac_ros.positioning.alternatives import farthest_range_m
+from rhs_isac_ros.positioning.estimate import Places, Sighting, regular
+from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.segments import concatenate, select
+from rhs_isac_ros.positioning.sheets import Sheets
+from rhs_isac_ros.positioning.templates import standard_normal
+
+
+class _Limits(NamedTuple):
+    """Numbers that trade the speed of products for their accuracy."""
+
+    # Largest number of products, and decrease of the logarithm of their masses.
+    products: int = 128
+    margin: float = 15.0
+    samples: int = 16
+    # Smallest share of a likelihood that is a constant or beyond a region.
+    least: float = 1e-9
+
+
+_LIMITS = _Limits()
+
+
+def places_of(outside: Sheets, log_ratio: float, scenario: Scenario, inside: Mixture) -> Places:
+    """Return the likelihood of places outside of the region of one surface.
+
+    `outside` is the posterior of a user outside, in (r, u, v), whose mass is the share that it
+    contains; `log_ratio` is the logarithm of the evidence outside relative to that inside, and
+    `inside` the density of a user inside, in the frame of the site.
+    """
+    pose, farthest_m = scenario.pose, farthest_range_m(scenario)
+    log_volume_m3 = float(np.log(np.ptp(scenario.roi_bounds_m, axis=0)).sum())
+    places = outside.to_mixture(pose)
+    log_prior = _log_prior(places.means, pose, farthest_m)
+    known = np.isfinite(log_prior)
+    log_rest = log_ratio + float(np.log(max(
+        1 - np.exp(places.log_weights[known]).sum(), _LIMITS.least)))
+    likelihood = inside.position().normalised().weighted(log_volume_m3)
+    if known.any():
+        likelihood = concatenate(likelihood, select(
+            places.weighted(log_ratio - np.where(known, log_prior, 0.0)), known))
+    return Places(likelihood, log_rest, farthest_m)
+
+
+def log_evidence(sightings: Sequence[Sighting], log_shares: Sequence[float],
+                 bounds_m: np.ndarray) -> float:
+    """Return the logarithm of the evidence outside, relative to the averages inside.
+
+    The region has the bounds [2, 3] [m]. `log_shares` are the logarithms of its probability among
+    positions in the region of each surface.
+    """
+    factors = [_factor(one, log_share, bounds_m)
+               for one, log_share in zip(sightings, log_shares, strict=True)]
+    product = functools.reduce(_times, factors)
+    constant = float(product.log_constant)
+    if not len(product.rows.means):
+        return constant
+    positions = _samples(product.rows)
+    logs = np.where(_is_outside(positions, bounds_m), _common_prior(sightings, positions), -np.inf)
+    total = np.logaddexp.reduce(
+        (product.rows.log_weights[:, None] + logs).ravel()) - np.log(_LIMITS.samples)
+    return float(np.logaddexp(constant, total))
+
+
+class _Factor(NamedTuple):
+    """Gaussians, maybe none, and a constant."""
+
+    rows: Mixture
+    log_constant: float
+
+
+def _factor(sighting: Sighting, log_share: float, bounds_m: np.ndarray) -> _Factor:
+    """Return the likelihood outside; the user may also be missing."""
+    places, log_seen = sighting.places, float(np.log1p(-sighting.missing))
+    rows = Mixture._make((np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3))))
+    if places is None:
+        # In the part of the region of the surface that is outside of that of the site.
+        log_rest = float(np.logaddexp(np.nan_to_num(sighting.outside_log_ratio), np.log(
+            max(-np.expm1(log_share), _LIMITS.least))))
+    else:
+        log_rest, found = places.log_rest, places.likelihood.widened(
+            sighting.pose.spread(places.likelihood.means))
+        rows = select(found, _is_outside(_samples(found), bounds_m).any(axis=1)).weighted(log_seen)
+    return _Factor(rows, float(np.logaddexp(np.log(sighting.missing), log_seen + log_rest)))
+
+
+def _times(one: _Factor, other: _Factor) -> _Factor:
+    """Multiply two likelihoods; keep the heaviest products."""
+    parts = [one.rows.weighted(other.log_constant), other.rows.weighted(one.log_constant)]
+    if len(one.rows.means) and len(other.rows.means):
+        first, second = one.rows.heaviest_pairs(other.rows, _LIMITS.products, _LIMITS.margin)
+        parts.append(select(one.rows, first).updated(select(other.rows, second)))
+    rows = concatenate(*parts)
+    heaviest = np.argsort(-rows.log_weights, kind='stable')[:_LIMITS.products]
+    return _Factor(select(rows, heaviest), one.log_constant + other.log_constant)
+
+
+def _samples(mixture: Mixture) -> np.ndarray:
+    """Return positions of each of C components, float64 [C, S, 3] [m]."""
+    roots = np.linalg.cholesky(regular(mixture.covariances))
+    found: np.ndarray = mixture.means[:, None] + np.matmul(
+        standard_normal(_LIMITS.samples), np.swapaxes(roots, 1, 2))
+    return found
+
+
+def _is_outside(positions: np.ndarray, bounds_m: np.ndarray) -> np.ndarray:
+    """Mark positions [..., 3] outside of a box, bool [...]."""
+    marked: np.ndarray = ((positions < bounds_m[0]) | (positions > bounds_m[1])).any(axis=-1)
+    return marked
+
+
+def _common_prior(sightings: Sequence[Sighting], positions: np.ndarray) -> np.ndarray:
+    """Return the logarithm of the mean of the surfaces' priors where all may see the user."""
+    logs = np.array([_log_prior(positions, one.pose, one.places.farthest_m)
+                     for one in sightings if one.places])
+    return np.where(np.isfinite(logs).all(axis=0), np.logaddexp.reduce(
+        logs, axis=0) - np.log(len(logs)), -np.inf)
+
+
+def _log_prior(positions: np.ndarray, pose: Pose, farthest_m: float) -> np.ndarray:
+    """Return the logarithm of a density uniform in range and solid angle in front of a surface."""
+    local = pose.to_surface(positions)
+    range_m = np.maximum(to_polar(local)[..., 0], np.finfo(float).tiny)
+    return np.where((local[..., 0] > 0) & (range_m < farthest_m),
+                    -np.log(2 * np.pi * farthest_m) - 2 * np.log(range_m), -np.inf)
