@@ -6,10 +6,8 @@ product of one sheet of every surface.
 
 The maximum of a product is found by a Gauss-Newton step from that of the sheets' moments. Weighted
 samples around it, in range and direction cosines of the surface with the thinnest sheet, yield the
-moments in the region. Two sheets of opposite curvature that touch have a product along a rim,
-which may be far from the maximum. Samples are therefore as wide as if the other sheets were
-thicker by what they bend over the samples. Where few of them carry the weight, or where two sheets
-meet again elsewhere, the region is halved, and each half has a proposal of its own.
+moments in the region; see `products`. Where few of them carry the weight, or where two sheets meet
+again elsewhere, the region is halved, and each half has a proposal of its own.
 
 To each likelihood, a constant is added: the user may be blocked from the surface, the search may
 have missed a mode, or the surface may be elsewhere. A surface that disagrees with the others thus
@@ -29,14 +27,22 @@ import numpy as np
 
 from rhs_isac_ros.model.arrays import checked_bounds, log_sum, mixture_weights
 from rhs_isac_ros.model.gaussian import likelihood_loss, moments, step_to_maximum, symmetric
-from rhs_isac_ros.model.geometry import jacobian, polar_derivative, to_polar, to_positions
+from rhs_isac_ros.model.geometry import polar_derivative, to_positions
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.alternatives import Outside, log_odds_of, rejection
 from rhs_isac_ros.positioning.beyond import log_evidence
 from rhs_isac_ros.positioning.estimate import SITE, Estimate, Sighting, regular
 from rhs_isac_ros.positioning.mixture import Mixture, log_volume, velocity_variance
+from rhs_isac_ros.positioning.products import (
+    Rows,
+    Term,
+    expanded,
+    logarithm,
+    prior_information,
+    proposal,
+)
 from rhs_isac_ros.positioning.segments import concatenate, select
-from rhs_isac_ros.positioning.sheets import Inside, log_values, move_inside
+from rhs_isac_ros.positioning.sheets import move_inside
 from rhs_isac_ros.positioning.templates import standard_normal
 from rhs_isac_ros.support.threads import one_blas_thread
 
@@ -49,25 +55,12 @@ class _Limits(NamedTuple):
     margins: tuple[float, float] = (25.0, 12.0)
     products: tuple[int, int] = (4000, 512)
     # Numbers of samples of a sheet, of a part of a product, and of all parts together that are
-    # computed at a time. Factor by which samples are wider than a Gaussian.
+    # computed at a time.
     of_sheet: int = 64
     of_product: int = 256
     samples: int = 1 << 13
-    spread: float = 1.2
-    # Information of a uniform prior in the region that narrows Gaussians, as a share of it, and
-    # smallest extent of the region along an axis, relative to the largest one.
+    # Information of a uniform prior in the region that narrows Gaussians, as a share of it.
     narrowing: float = 0.25
-    extent: float = 1e-3
-    # Step of second differences in standard deviations of a Gaussian, and factor by which sheets
-    # are thicker, as they bend more in the tails.
-    step: float = 1.5
-    tails: float = 3.0
-    # Largest distance of another place where two sheets meet, in standard deviations of the first
-    # one, and smallest distance of the sheets between both places, in those of the second one.
-    reach: float = 3.5
-    apart: float = 2.0
-    # Share of the way to this place that has to be inside the part of the region.
-    within: float = 0.75
     # Share of the samples that have to be effective in parts whose weight is within a margin of
     # the best. Others are halved, this many at a time and so often.
     effective: float = 0.35
@@ -165,39 +158,6 @@ def _log_share_of(mixture: Mixture, bounds_m: np.ndarray) -> float:
         return float(np.log(mixture.probabilities @ within.mean(axis=1)))
 
 
-class _Rows(NamedTuple):
-    """T sheets or constants of one surface."""
-
-    points: np.ndarray  # Maxima, (r [m], u, v), float64 [T, 3].
-    covariances: np.ndarray  # Float64 [T, 3, 3].
-    curvature: np.ndarray  # Their inverses; 0 for a constant.
-    log_peaks: np.ndarray  # Float64 [T].
-    log_limits: np.ndarray  # Largest values in the region, infinite if unknown, float64 [T].
-    is_sheet: np.ndarray  # Whether the row is not a constant, bool [T].
-
-
-class _Term(NamedTuple):
-    """The factors of T products that are due to one surface."""
-
-    pose: Pose
-    rows: _Rows
-
-    def logarithm(self, positions: np.ndarray) -> np.ndarray:
-        """Evaluate the factors at positions [T, S, 3] [m], float64 [T, S]."""
-        local, rows = self.pose.to_surface(positions), self.rows
-        values = np.minimum(log_values(
-            local, rows.points, rows.curvature, rows.log_peaks), rows.log_limits[:, None])
-        # No user behind the surface is in sight.
-        return np.where((local[..., 0] <= 0) & rows.is_sheet[:, None], -np.inf, values)
-
-    def expanded(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return gradient [T, 3] and curvature [T, 3, 3] at positions [T, 3] [m]."""
-        points = to_polar(self.pose.to_surface(positions))
-        derivative = polar_derivative(points) @ self.pose.rotation.T
-        slope = derivative.swapaxes(1, 2) @ self.rows.curvature
-        return (slope @ (self.rows.points - points)[..., None])[..., 0], slope @ derivative
-
-
 class _Factor(NamedTuple):
     """The likelihood of one surface: C sheets and, as the last row, a constant.
 
@@ -205,7 +165,7 @@ class _Factor(NamedTuple):
     """
 
     pose: Pose
-    rows: _Rows
+    rows: Rows
     moments: Mixture  # Averages and moments inside the region, in the frame of the site.
     log_share: float  # Logarithm of the surface's probability of the region of the site.
     thickness: float  # Decreases with the median information about the range.
@@ -244,19 +204,19 @@ class _Factor(NamedTuple):
             log_limit = log_share
         return cls(
             pose, concatenate(
-                _Rows(sheets.means, sheets.covariances, curvature, log_peaks,
-                      np.full(len(kept), log_limit), np.ones(len(kept), bool)),
-                _Rows(sheets.means[:1], np.eye(3)[None], np.zeros((1, 3, 3)),
-                      np.log([sighting.missing]), np.full(1, np.inf), np.zeros(1, bool))),
+                Rows(sheets.means, sheets.covariances, curvature, log_peaks,
+                     np.full(len(kept), log_limit), np.ones(len(kept), bool)),
+                Rows(sheets.means[:1], np.eye(3)[None], np.zeros((1, 3, 3)),
+                     np.log([sighting.missing]), np.full(1, np.inf), np.zeros(1, bool))),
             Mixture._make((
                 np.append(inside.log_weights - log_total, np.log(sighting.missing)),
                 np.append(inside.means, centre[None], axis=0),
                 np.append(inside.covariances, regular(np.diag(size**2 / 12))[None], axis=0))),
             log_share, -statistics.median([*curvature[:, 0, 0].tolist(), 0.0]))
 
-    def term(self, chosen: np.ndarray) -> _Term:
+    def term(self, chosen: np.ndarray) -> Term:
         """Return the rows with these indices, int [T], as factors of products."""
-        return _Term(self.pose, select(self.rows, chosen))
+        return Term(self.pose, select(self.rows, chosen))
 
 
 class _Products(NamedTuple):
@@ -308,25 +268,25 @@ class _Products(NamedTuple):
     def climbed(self, factors: Sequence[_Factor], bounds_m: np.ndarray) -> '_Products':
         """Move to the maxima in the region by a Gauss-Newton step."""
         found, _ = self._single(factors)
-        prior = _LIMITS.narrowing * _prior_information(bounds_m)
+        prior = _LIMITS.narrowing * prior_information(bounds_m)
         for mine, terms in self._by_reference(factors):
             around = terms[0].pose
             place = np.clip(self.moments.means[mine], *bounds_m)
-            points, gradient, curvature = _expanded(terms, place, prior)
+            points, gradient, curvature = expanded(terms, place, prior)
             place = around.to_site(to_positions(move_inside(
                 points + step_to_maximum(curvature, gradient), curvature, bounds_m, around)))
-            points, gradient, curvature = _expanded(terms, place, prior)
+            points, gradient, curvature = expanded(terms, place, prior)
             derivative = polar_derivative(points) @ around.rotation.T
             covariances = np.linalg.inv(np.swapaxes(derivative, 1, 2) @ curvature @ derivative)
             found.means[mine], found.covariances[mine] = place, covariances
             # Where this has not converged, the next step still raises the value.
             rise = np.sum(gradient * step_to_maximum(curvature, gradient), axis=1) / 2
             found.log_weights[mine] = (
-                _logarithm(terms, place[:, None])[:, 0] + rise + log_volume(covariances))
+                logarithm(terms, place[:, None])[:, 0] + rise + log_volume(covariances))
         return _Products(self.rows, found)
 
     def _by_reference(self, factors: Sequence[_Factor]
-                      ) -> Iterator[tuple[np.ndarray, list[_Term]]]:
+                      ) -> Iterator[tuple[np.ndarray, list[Term]]]:
         """Yield indices of products of several sheets, and their factors.
 
         That of the surface with the thinnest sheets comes first.
@@ -416,7 +376,7 @@ class _Samples(NamedTuple):
 
     positions: np.ndarray  # Float64 [P, S, 3] [m].
     logs: np.ndarray  # Logarithms of weights for averages over the region, float64 [P, S].
-    beyond: np.ndarray  # Of `_proposal`, float64 [P, 3] [m]; NaN if there is none.
+    beyond: np.ndarray  # Of `proposal`, float64 [P, 3] [m]; NaN if there is none.
 
 
 class _Parts(NamedTuple):
@@ -435,10 +395,10 @@ class _Parts(NamedTuple):
         positions = np.empty((len(self.owners), *normal.shape))
         logs, beyond = np.empty(positions.shape[:2]), np.empty_like(self.starts_m)
         for mine, terms in products._by_reference(factors):
-            gaussians, beyond[mine] = _proposal(
+            gaussians, beyond[mine] = proposal(
                 terms, self.starts_m[mine], np.stack([self.low_m[mine], self.high_m[mine]]))
             positions[mine], logs[mine] = gaussians.sample(normal)
-            logs[mine] += _logarithm(terms, positions[mine])
+            logs[mine] += logarithm(terms, positions[mine])
         size = np.ptp(bounds_m, axis=0)
         shares = (self.high_m - self.low_m)[:, size > 0] / size[size > 0]
         return _Samples(positions, logs + np.log(shares).sum(axis=1)[:, None], beyond)
@@ -463,111 +423,9 @@ class _Parts(NamedTuple):
         return concatenate(*halves)
 
 
-def _terms(factors: Sequence[_Factor], rows: np.ndarray) -> list[_Term]:
+def _terms(factors: Sequence[_Factor], rows: np.ndarray) -> list[Term]:
     """Return the factors of products of the given rows, int [T, number of factors]."""
     return [one.term(chosen) for one, chosen in zip(factors, rows.T, strict=True)]
-
-
-def _logarithm(terms: Sequence[_Term], positions: np.ndarray) -> np.ndarray:
-    """Evaluate products at positions [T, S, 3] [m], float64 [T, S]."""
-    return functools.reduce(np.add, (one.logarithm(positions) for one in terms))
-
-
-def _prior_information(bounds_m: np.ndarray) -> np.ndarray:
-    """Return the information of uniform priors in boxes [2, ..., 3] [m], [..., 3, 3] [1/m^2]."""
-    size = np.ptp(bounds_m, axis=0)
-    smallest = _LIMITS.extent * size.max(axis=-1, keepdims=True)
-    return 12 / np.maximum(size, smallest)[..., None]**2 * np.eye(3)
-
-
-def _expanded(terms: Sequence[_Term], positions: np.ndarray, prior: np.ndarray
-              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (r, u, v) around the first surface, and gradient and curvature with respect to it.
-
-    The curvature includes the information of a prior in the site, float64 [3, 3] [1/m^2].
-    """
-    pose = terms[0].pose
-    points = to_polar(pose.to_surface(positions))
-    by_point = pose.rotation @ jacobian(points)
-    gradient, curvature = (functools.reduce(np.add, parts) for parts in zip(
-        *(one.expanded(positions) for one in terms), strict=True))
-    transposed = by_point.swapaxes(1, 2)
-    return (points, (transposed @ gradient[..., None])[..., 0],
-            symmetric(transposed @ (curvature + prior) @ by_point))
-
-
-def _proposal(terms: Sequence[_Term], positions: np.ndarray, bounds_m: np.ndarray
-              ) -> tuple[Inside, np.ndarray]:
-    """Return Gaussians that are as wide as products around positions [T, 3] [m], and `beyond`.
-
-    In (r, u, v) of the first surface, the sheets of the others are curved. Over the Gaussian, they
-    are thicker by the second differences of their coordinates. A sheet may meet that of the first
-    surface again, `beyond` a place where both are apart, [T, 3] [m]; NaN where none does.
-    """
-    (pose, first), *others = terms
-    prior, centre = _prior_information(bounds_m), bounds_m.mean(axis=0)
-    positions, beyond = np.clip(positions, *bounds_m), np.full_like(positions, np.nan)
-    (free,) = np.nonzero((bounds_m[1] > bounds_m[0]).any(axis=0))
-    if len(free) == 1:
-        # A sphere meets a line at two points.
-        sight = positions - pose.origin
-        along_m2 = first.points[:, 0]**2 - np.sum(np.delete(sight, free, axis=1)**2, axis=1)
-        along_m = np.copysign(np.sqrt(np.maximum(along_m2, 0.0))[:, None], sight[:, free])
-        mirrored = positions.copy()
-        positions[:, free], mirrored[:, free] = pose.origin[free] + [along_m, -along_m]
-        found = np.all((mirrored >= bounds_m[0]) & (mirrored <= bounds_m[1]), axis=1)
-        beyond[found] = mirrored[found]
-    points = to_polar(pose.to_surface(positions))
-    by_point = pose.rotation @ jacobian(points)
-    # The centre and the width of the sheet in the region.
-    by_site = by_point.swapaxes(1, 2) @ prior
-    total = symmetric(first.curvature + by_site @ by_point)
-    positions = np.clip(pose.to_site(to_positions(points + step_to_maximum(
-        total, (by_site @ (centre - positions)[..., None])[..., 0]))), *bounds_m)
-    points = to_polar(pose.to_surface(positions))
-    by_point = pose.rotation @ jacobian(points)
-    curvature = first.curvature
-    gradient = (curvature @ (first.points - points)[..., None])[..., 0]
-    axes = _LIMITS.step * np.linalg.cholesky(np.linalg.inv(total)).swapaxes(1, 2)
-    around = pose.to_site(to_positions(
-        points[:, None] + np.concatenate([axes, -axes], axis=1)))
-    for other, rows in others:
-        here = to_polar(other.to_surface(positions))
-        change = to_polar(other.to_surface(around)) - here[:, None]
-        second = (change[:, :3] + change[:, 3:]) / _LIMITS.step**2
-        slopes = (change[:, :3, 0] - change[:, 3:, 0]) / (2 * _LIMITS.step)
-        turns, chosen = _turns(slopes, second[:, :, 0], rows)
-        places = pose.to_site(to_positions(
-            points + axes[chosen] * turns[:, None] / _LIMITS.step))
-        nearest = np.clip(places, *bounds_m)
-        found = (np.linalg.norm(nearest - positions, axis=1)
-                 > _LIMITS.within * np.linalg.norm(places - positions, axis=1))
-        beyond[found] = nearest[found]
-        thicker = _LIMITS.tails**2 * (
-            np.sum(second**2, axis=1) / 2 + np.sum(second, axis=1)**2 / 4)
-        information = rows.is_sheet[:, None, None] * np.linalg.inv(
-            rows.covariances + thicker[:, :, None] * np.eye(3))
-        slope = polar_derivative(here) @ other.rotation.T @ by_point
-        by_slope = slope.swapaxes(1, 2) @ information
-        curvature = curvature + by_slope @ slope
-        gradient = gradient + (by_slope @ (rows.points - here)[..., None])[..., 0]
-    wide = 1 / _LIMITS.spread**2
-    return Inside.of(
-        points, wide * gradient, wide * symmetric(curvature), bounds_m, pose), beyond
-
-
-def _turns(slopes: np.ndarray, second: np.ndarray, rows: _Rows
-           ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return the farthest places at which ranges are the same again, [T], and their axes.
-
-    Takes the derivatives of the ranges along the axes of the first sheet, [T, 3]. Places are in
-    standard deviations of it; NaN if the sheet does not leave that of `rows` in between.
-    """
-    turns = -2 * slopes / np.where(second == 0, np.inf, second)
-    apart = np.abs(slopes * turns) / 4 / np.sqrt(rows.covariances[:, :1, 0])
-    apart[(np.abs(turns) > _LIMITS.reach) | ~rows.is_sheet[:, None]] = 0.0
-    chosen = np.arange(len(turns)), np.argmax(apart, axis=1)
-    return np.where(apart[chosen] > _LIMITS.apart, turns[chosen], np.nan), chosen
 
 
 def _effective(logs: np.ndarray) -> np.ndarray:

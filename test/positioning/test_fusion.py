@@ -159,6 +159,42 @@ def test_sheets_that_are_broad_across_have_the_moments_of_their_product(
     np.testing.assert_allclose(np.diag(fused.covariance) / np.diag(covariance), 1.0, atol=0.2)
 
 
+ABOVE = Pose((10.0, 3.0, 9.0), (0.0, 0.5**0.5, 0.0, 0.5**0.5), EXACT)
+
+
+def multilaterated(sightings, std, n=40_000):
+    """Return mean and covariance of a product of thin sheets, by samples of the three ranges.
+
+    Newton's method finds the place with each triple of ranges.
+    """
+    rng, origins = np.random.default_rng(0), np.stack([one.pose.origin for one in sightings])
+    peaks = np.stack([np.linalg.norm(one.mixture.means - one.pose.origin, axis=1)
+                      for one in sightings])
+    ranges = std[0] * rng.standard_normal((n, 3)) + np.stack(
+        [rng.choice(row, n) for row in peaks], axis=1)
+    log_proposal = np.logaddexp.reduce(
+        -((ranges[:, :, None] - peaks) / std[0])**2 / 2, axis=2).sum(axis=1)
+    places = np.tile(PLACE, (n, 1))
+    for _ in range(6):
+        sight = places[:, None] - origins
+        found = np.linalg.norm(sight, axis=2)
+        slopes = sight / found[:, :, None]
+        places += np.linalg.solve(slopes, (ranges - found)[..., None])[..., 0]
+    logs = (sum(log_likelihood(one, places, std) for one in sightings)
+            - log_proposal - np.linalg.slogdet(slopes)[1])
+    weights = np.exp(logs - logs.max()) / np.exp(logs - logs.max()).sum()
+    assert 1 / np.sum(weights**2) > n / 50
+    mean = weights @ places
+    return mean, (places - mean).T @ ((places - mean) * weights[:, None])
+
+
+def test_many_thin_sheets_of_three_surfaces_meet_in_points():
+    std, rng = np.array([0.001, 0.05, 0.05]), np.random.default_rng(0)
+    sightings = [sheets(pose, PLACE + rng.normal(scale=0.3, size=(8, 3)), np.zeros(8), std)
+                 for pose in (FRONT, SIDE, ABOVE)]
+    assert_moments(fuse(sightings, BOUNDS), *multilaterated(sightings, std))
+
+
 def test_positions_are_inside_the_region():
     # The mode has its maximum 0.3 m above the region.
     sightings = [sheets(FRONT, [8.0, 1.0, 1.3])]
