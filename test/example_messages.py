@@ -33,7 +33,9 @@ def example_message(
                  'surface_quaternion': np.array([0.6, 0.0, 0.0, 0.8]),
                  'surface_uncertainty': 1e-4 * np.eye(6), 'sheet_log_weights': np.zeros(1),
                  'sheet_means': np.array([[8.0, -0.25, 0.0]]),
-                 'sheet_covariances': 1e-4 * np.eye(3)[None]} | given
+                 'sheet_covariances': 1e-4 * np.eye(3)[None],
+                 'outside_log_weights': np.zeros(1), 'outside_means': np.array([[18.0, 2.0, 0.5]]),
+                 'outside_covariances_m2': np.eye(3)[None], 'outside_range_m': 30.0} | given
     fields = dataclasses.fields(kind)
     for field in fields:
         meta = field.metadata

@@ -16,6 +16,8 @@ FALSE_ALARM = 1e-9
 # Smallest square of a pivot relative to the largest variance, in units of the rounding error of n
 # variances. Below it, bounds have errors of more than about a per cent.
 _MIN_PIVOT = 4
+# Largest difference from a symmetric matrix, relative to the largest element.
+_ASYMMETRY = 1e-6
 
 
 class Marginal(NamedTuple):
@@ -30,6 +32,16 @@ class Marginal(NamedTuple):
     offset: np.ndarray
     # Log of the integral over the Q unknowns relative to the maximum [N], without factors of 2 pi.
     log_volume: np.ndarray
+
+
+def covariance_problem(covariances: np.ndarray) -> str:
+    """Describe matrices [C, D, D] that are no covariances with inverses; return '' if they are."""
+    smallest = np.linalg.eigvalsh(covariances).min(initial=np.inf)
+    asymmetry = np.abs(covariances - np.swapaxes(covariances, 1, 2)).max(initial=0.0)
+    if smallest > 0 and asymmetry <= _ASYMMETRY * np.abs(covariances).max(initial=0.0):
+        return ''
+    return (f'eigenvalue {smallest:g}, asymmetry {asymmetry:g}, expected symmetric matrices with '
+            'positive eigenvalues')
 
 
 def covariance_root(scenario: Scenario, covariance: np.ndarray, *, orthogonal: bool = False

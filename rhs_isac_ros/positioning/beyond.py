@@ -38,25 +38,21 @@ class _Limits(NamedTuple):
 _LIMITS = _Limits()
 
 
-def places_of(outside: Sheets, log_ratio: float, scenario: Scenario, inside: Mixture) -> Places:
+def places_of(outside: Sheets, log_ratio: float, scenario: Scenario) -> Places:
     """Return the likelihood of places outside of the region of one surface.
 
     `outside` is the posterior of a user outside, in (r, u, v), whose mass is the share that it
-    contains; `log_ratio` is the logarithm of the evidence outside relative to that inside, and
-    `inside` the density of a user inside, in the frame of the site.
+    contains; `log_ratio` is the logarithm of the evidence outside relative to that inside.
     """
     pose, farthest_m = scenario.pose, farthest_range_m(scenario)
-    log_volume_m3 = float(np.log(np.ptp(scenario.roi_bounds_m, axis=0)).sum())
     places = outside.to_mixture(pose)
     log_prior = _log_prior(places.means, pose, farthest_m)
     known = np.isfinite(log_prior)
     log_rest = log_ratio + float(np.log(max(
         1 - np.exp(places.log_weights[known]).sum(), _LIMITS.least)))
-    likelihood = inside.position().normalised().weighted(log_volume_m3)
-    if known.any():
-        likelihood = concatenate(likelihood, select(
-            places.weighted(log_ratio - np.where(known, log_prior, 0.0)), known))
-    return Places(likelihood, log_rest, farthest_m)
+    return Places(
+        select(places.weighted(log_ratio - np.where(known, log_prior, 0.0)), known), log_rest,
+        farthest_m, float(np.log(np.ptp(scenario.roi_bounds_m, axis=0)).sum()))
 
 
 def log_evidence(sightings: Sequence[Sighting], log_shares: Sequence[float],
@@ -95,8 +91,9 @@ def _factor(sighting: Sighting, log_share: float, bounds_m: np.ndarray) -> _Fact
         log_rest = float(np.logaddexp(np.nan_to_num(sighting.outside_log_ratio), np.log(
             max(-np.expm1(log_share), _LIMITS.least))))
     else:
-        log_rest, found = places.log_rest, places.likelihood.widened(
-            sighting.pose.spread(places.likelihood.means))
+        inside = sighting.mixture.position().normalised().weighted(places.log_volume)
+        log_rest, found = places.log_rest, concatenate(inside, places.gaussians)
+        found = found.widened(sighting.pose.spread(found.means))
         rows = select(found, _is_outside(_samples(found), bounds_m).any(axis=1)).weighted(log_seen)
     return _Factor(rows, float(np.logaddexp(np.log(sighting.missing), log_seen + log_rest)))
 

@@ -33,14 +33,15 @@ class SignalError(ValueError):
 class Places(NamedTuple):
     """The likelihood of positions outside of the region, relative to the average inside.
 
-    It is a sum of Gaussians and a constant. Those of positions inside, which may be outside of the
-    region of a site, are part of the sum.
+    It is the sum of Gaussians and a constant. Positions inside, which may be outside of the region
+    of a site, have the `Sighting.mixture`.
     """
 
-    likelihood: Mixture  # In the frame of the site, D = 3; log-weights are those of integrals.
+    gaussians: Mixture  # In the frame of the site, D = 3; log-weights are those of integrals.
     log_rest: float  # Logarithm of the constant.
     # Largest range of positions, whose prior is uniform in range and solid angle [m].
     farthest_m: float
+    log_volume: float  # Logarithm of the volume of the region [m^3].
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ class Sighting:
         if pose == self.pose:
             return self
         places = self.places and self.places._replace(
-            likelihood=self.places.likelihood.moved(self.pose, pose))
+            gaussians=self.places.gaussians.moved(self.pose, pose))
         return dataclasses.replace(self, pose=pose, places=places,
                                    mixture=self.mixture.moved(self.pose, pose))
 

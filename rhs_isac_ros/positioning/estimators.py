@@ -582,8 +582,8 @@ class _Found(NamedTuple):
         pose = estimator.scenario.pose
         placed = mixture.scaled(estimator._scale(fit)).moved(Pose(), pose)
         log_ratio = self.log_ratios.get(Outside.name, -np.inf)
-        places = places_of(self.outside(), log_ratio, estimator.scenario, placed
-                           ) if self.outside and size.all() and np.isfinite(log_ratio) else None
+        places = places_of(self.outside(), log_ratio, estimator.scenario) if (
+            self.outside and size.all() and np.isfinite(log_ratio)) else None
         return Sighting(
             pose, placed.weighted(log_evidence),
             float(np.clip(blocked + (1 - blocked) * MISS_PROBABILITY, 0.0, 1 - 1e-12)), sheets,

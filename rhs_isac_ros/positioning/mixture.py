@@ -10,7 +10,12 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from rhs_isac_ros.model.arrays import log_sum, mixture_weights, numbers, read_only
-from rhs_isac_ros.model.gaussian import moments, step_to_maximum, symmetric
+from rhs_isac_ros.model.gaussian import (
+    covariance_problem,
+    moments,
+    step_to_maximum,
+    symmetric,
+)
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.positioning.segments import concatenate, select
 
@@ -24,8 +29,6 @@ _WEIGHT_MARGIN = 18.0
 _FIXED_MPS = 1e-5
 # Largest share of the information of a component that a prior is taken to be.
 _MOST_OF_PRIOR = 0.999
-# Largest difference from a symmetric matrix, relative to the largest element.
-_ASYMMETRY = 1e-6
 _MixtureT = TypeVar('_MixtureT', bound='Mixture')
 
 
@@ -77,12 +80,8 @@ class Mixture(_Arrays):
         if spreads.shape != (*centres.shape, centres.shape[1]):
             raise ValueError(f'covariances: shape {spreads.shape}, expected '
                              f'{(*centres.shape, centres.shape[1])}')
-        asymmetry = np.abs(spreads - np.swapaxes(spreads, 1, 2)).max()
-        smallest = np.linalg.eigvalsh(spreads).min()
-        if not (asymmetry <= _ASYMMETRY * np.abs(spreads).max() and smallest > 0):
-            raise ValueError(
-                f'covariances: eigenvalue {smallest:g}, asymmetry {asymmetry:g}, expected '
-                'symmetric matrices with positive eigenvalues')
+        if problem := covariance_problem(spreads):
+            raise ValueError(f'covariances: {problem}')
         return super().__new__(cls, weights, centres, spreads)
 
     @property

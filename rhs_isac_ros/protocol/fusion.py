@@ -2,7 +2,8 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from rhs_isac_ros.bounds import site_crlb
 from rhs_isac_ros.positioning import Estimate, Mixture, Sighting
 from rhs_isac_ros.positioning.agreement import PoseTest, pair_agreements
 from rhs_isac_ros.positioning.alternatives import LIMIT, Outside
+from rhs_isac_ros.positioning.estimate import Places
 from rhs_isac_ros.positioning.fusion import Fuser
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.sheets import Sheets
@@ -37,7 +39,12 @@ _MAX_MISSED = 3
 _MAX_CLOSED, _MAX_OPEN = 256, 64
 
 
-_LOG_RATIOS = ('outside_log_ratio', 'blocked_log_ratio', 'misfit_log_ratio')
+# Names of fields, in the order of those of `Sheets` and `Places`.
+_SHEETS = 'sheet_log_weights', 'sheet_means', 'sheet_covariances'
+_PLACES = ('outside_log_weights', 'outside_means', 'outside_covariances_m2', 'outside_log_rest',
+           'outside_range_m', 'region_log_volume')
+_LOG_RATIOS = 'outside_log_ratio', 'blocked_log_ratio', 'misfit_log_ratio'
+_MixtureT = TypeVar('_MixtureT', bound=Mixture)
 
 
 def posterior_of(source: object, sighting: Sighting, **fields: float | str) -> m.Posterior:
@@ -45,28 +52,40 @@ def posterior_of(source: object, sighting: Sighting, **fields: float | str) -> m
     mixture, pose = sighting.mixture.normalised(), sighting.pose
     if len(mixture.means) > m.MAX_COMPONENTS:
         mixture = mixture.reduce(m.MAX_COMPONENTS)
-    sheets: dict[str, np.ndarray] = {}
+    known: dict[str, np.ndarray | float] = {}
     if sighting.sheets is not None:
-        heaviest = np.argsort(-sighting.sheets.log_weights, kind='stable')[:m.MAX_COMPONENTS]
-        sheets = dict(zip(('sheet_log_weights', 'sheet_means', 'sheet_covariances'),
-                          select(sighting.sheets, heaviest).normalised(), strict=True))
+        known.update(zip(_SHEETS, _heaviest(sighting.sheets).normalised(), strict=True))
+    if sighting.places is not None:
+        gaussians, *rest = sighting.places
+        known.update(zip(_PLACES, (*_heaviest(gaussians), *rest), strict=True))
     return m.derive(
         m.Posterior, source, log_weights=mixture.log_weights, means=mixture.means,
         covariances_m2=mixture.covariances, log_evidence=sighting.mixture.log_mass,
         missing_probability=float(np.clip(sighting.missing, _LEAST_MISSING, _MOST_MISSING)),
         surface_position_m=pose.origin, surface_quaternion=pose.unit_quaternion,
-        surface_uncertainty=pose.covariance, **sheets,
+        surface_uncertainty=pose.covariance, **known,
         **{name: getattr(sighting, name) for name in _LOG_RATIOS}, **fields)
 
 
 def sighting_of(message: m.Posterior) -> Sighting:
     """Return the likelihood in a message."""
     mixture = Mixture(message.log_weights, message.means, message.covariances_m2)
-    sheets = Sheets(message.sheet_log_weights, message.sheet_means, message.sheet_covariances
-                    ) if len(message.sheet_log_weights) else None
+    sheets = Sheets(*_values(message, _SHEETS)) if len(message.sheet_log_weights) else None
+    *gaussians, log_rest, range_m, log_volume = _values(message, _PLACES)
+    places = Places(Mixture._make(gaussians), log_rest, range_m, log_volume) if range_m else None
     return Sighting(message.surface_pose, mixture.weighted(message.log_evidence),
-                    message.missing_probability, sheets,
-                    **{name: getattr(message, name) for name in _LOG_RATIOS})
+                    message.missing_probability, sheets, places=places,
+                    **dict(zip(_LOG_RATIOS, _values(message, _LOG_RATIOS), strict=True)))
+
+
+def _heaviest(gaussians: _MixtureT) -> _MixtureT:
+    """Return the Gaussians, without those of the smallest weights beyond the most of a message."""
+    return select(gaussians, np.sort(np.argsort(
+        -gaussians.log_weights, kind='stable')[:m.MAX_COMPONENTS]))
+
+
+def _values(message: m.Posterior, names: Sequence[str]) -> list[Any]:
+    return [getattr(message, name) for name in names]
 
 
 @dataclasses.dataclass

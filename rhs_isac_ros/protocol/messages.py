@@ -13,6 +13,7 @@ import numpy as np
 from rhs_isac_ros.model import Pose, Scenario
 from rhs_isac_ros.model.arrays import all_finite, position_problem
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
+from rhs_isac_ros.model.gaussian import covariance_problem
 from rhs_isac_ros.support.fields import Field
 
 
@@ -385,28 +386,43 @@ class Posterior(Message):
     outside_log_ratio: float = optional_float(math.nan)
     blocked_log_ratio: float = optional_float(math.nan)
     misfit_log_ratio: float = optional_float(math.nan)
+    #: Likelihood of positions outside of the region, relative to the average inside: Gaussians,
+    #: the logarithm of a constant, largest range, and logarithm of the volume of the region [m^3].
+    #: If the range is 0, they state nothing.
+    outside_log_weights: np.ndarray = array('PLACES', empty=True)
+    outside_means: np.ndarray = array(
+        'PLACES 3', empty=True, low=-MAX_COORDINATE_M, high=MAX_COORDINATE_M)
+    outside_covariances_m2: np.ndarray = array(
+        'PLACES 3 3', empty=True, low=-MAX_COORDINATE_M**2, high=MAX_COORDINATE_M**2)
+    outside_log_rest: float = 0.0
+    outside_range_m: float = number(0, MAX_COORDINATE_M, default=0.0)
+    region_log_volume: float = 0.0
 
     def own_sizes(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """Return the numbers of Gaussians, COMPONENTS and SHEETS, and their dimension D."""
+        """Return the numbers of Gaussians, and the dimension D of the COMPONENTS."""
         return {'COMPONENTS': len(self.log_weights), 'SHEETS': len(self.sheet_log_weights),
+                'PLACES': len(self.outside_log_weights),
                 'D': 6 if self.means.shape[1:] == (6,) else 3}
 
     def own_problem(self) -> str:
         """Describe a mixture without a density, a pose that is none, or means behind it."""
-        for log_weights, covariances in (('log_weights', 'covariances_m2'),
-                                         ('sheet_log_weights', 'sheet_covariances')):
-            n, matrices = len(getattr(self, log_weights)), getattr(self, covariances)
-            if n > MAX_COMPONENTS:
-                return f'{log_weights}: {n} components, expected at most {MAX_COMPONENTS}'
-            smallest = np.linalg.eigvalsh(matrices).min(initial=np.inf)
-            if not smallest > 0:
-                return f'{covariances}: eigenvalue {smallest:g}, expected positive eigenvalues'
+        for fewest, log_weights, covariances in (
+                (1, 'log_weights', 'covariances_m2'),
+                (0, 'sheet_log_weights', 'sheet_covariances'),
+                (0, 'outside_log_weights', 'outside_covariances_m2')):
+            n = len(getattr(self, log_weights))
+            if not fewest <= n <= MAX_COMPONENTS:
+                return f'{log_weights}: {n} components, expected {fewest} to {MAX_COMPONENTS}'
+            if problem := covariance_problem(getattr(self, covariances)):
+                return f'{covariances}: {problem}'
         try:
             pose = self.surface_pose
         except ValueError as error:
             return f'surface_{error}'
-        problem = position_problem(pose.to_surface(self.means[:, :3]))
-        return f'means: {problem}' if problem else ''
+        for name in ('means', 'outside_means'):
+            if problem := position_problem(pose.to_surface(getattr(self, name)[:, :3])):
+                return f'{name}: {problem}'
+        return ''
 
     @property
     def surface_pose(self) -> Pose:

@@ -26,8 +26,8 @@ def seen(scenario, place=None, share=1.0, inside=INSIDE, log_ratio=LOG_RATIO):
     if place is not None:
         outside = Sheets(np.log([share]), to_polar(scenario.pose.to_surface(place))[None],
                          np.diag(STD**2)[None])
-        places = places_of(outside, log_ratio, scenario, inside)
-    return Sighting(scenario.pose, INSIDE, 1e-9, outside_log_ratio=log_ratio, places=places)
+        places = places_of(outside, log_ratio, scenario)
+    return Sighting(scenario.pose, inside, 1e-9, outside_log_ratio=log_ratio, places=places)
 
 
 def evidence(*sightings):
@@ -60,7 +60,7 @@ def test_a_surface_without_places_has_no_influence_on_the_place():
 def test_products_have_the_integral_of_the_likelihoods():
     one, other = seen(FRONT, PLACE), seen(SIDE, PLACE)
     positions = np.random.default_rng(0).uniform(PLACE - 5, PLACE + 5, (100_000, 3))
-    logs = sum(sighting.places.likelihood.log_density(positions) for sighting in (one, other))
+    logs = sum(sighting.places.gaussians.log_density(positions) for sighting in (one, other))
     ranges = [to_polar(each.pose.to_surface(positions))[:, 0] for each in (FRONT, SIDE)]
     prior = np.mean([1 / (2 * np.pi * sighting.places.farthest_m * range_m**2)
                      for sighting, range_m in zip((one, other), ranges, strict=True)], axis=0)
@@ -86,4 +86,4 @@ def test_a_place_moves_with_its_surface():
     sighting = seen(SIDE, PLACE)
     places = sighting.at(moved).places
     np.testing.assert_allclose(
-        places.likelihood.means, sighting.places.likelihood.means + [0.1, 0.0, 0.0], atol=1e-9)
+        places.gaussians.means, sighting.places.gaussians.means + [0.1, 0.0, 0.0], atol=1e-9)

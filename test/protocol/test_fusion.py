@@ -2,13 +2,15 @@
 
 import dataclasses
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rhs_isac_ros.bounds import site_crlb
-from rhs_isac_ros.model import Pose
-from rhs_isac_ros.positioning import Mixture, Sighting, Site, fuse
+from rhs_isac_ros.codebook import Codebook
+from rhs_isac_ros.model import Pose, Scenario
+from rhs_isac_ros.positioning import Mixture, Sighting, Site, SiteEstimator, fuse
 from rhs_isac_ros.positioning.agreement import WINDOW
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import (
@@ -22,6 +24,7 @@ from rhs_isac_ros.protocol.fusion import Fusion, posterior_of, sighting_of
 from rhs_isac_ros.protocol.settings import FusionSettings
 from rhs_isac_ros.system import System
 
+CONFIG = Path(__file__).parents[2] / 'config'
 POSES = {'front': Pose(), 'side': Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.0, 1.0))}
 PLACE = np.array([9.0, 1.0, 0.3])
 WAIT_S = 0.2
@@ -84,6 +87,58 @@ def test_a_message_holds_what_the_fusion_needs(answer):
     assert np.allclose(sighting.pose.covariance, POSES['side'].covariance)
     assert sighting.mixture.log_mass == pytest.approx(-3.0)
     assert np.array_equal(sighting.mixture.means, PLACE[None])
+
+
+@pytest.fixture(scope='module')
+def small_site():
+    """A site in which users outside are often near a position inside."""
+    scenario = Scenario.from_yaml(CONFIG / 'quick.yaml')
+    codebook = Codebook.load(CONFIG / 'codebook_quick.yaml')
+    site = Site({name: System(dataclasses.replace(scenario, pose=pose), codebook)
+                 for name, pose in POSES.items()}, scenario.roi_bounds_m)
+    return site, SiteEstimator(site)
+
+
+@pytest.mark.parametrize(('place', 'seed', 'fix'), [
+    ((4.0, -2.4, -1.0), 1, False), ((13.1, -6.3, 0.8), 13, False), ((13.1, -6.3, 0.8), 15, True)])
+def test_messages_decide_as_the_library_whether_surfaces_see_a_user_outside_at_one_place(
+        small_site, place, seed, fix):
+    site, estimator = small_site
+    received = {name: shots[0] for name, shots in site.sample(
+        np.array([place]), np.random.default_rng(seed)).items()}
+    sightings = estimator.sightings(received)
+    expected = estimator.estimate(received)
+    assert expected.fix == fix
+    # Only the places decide.
+    assert fuse([dataclasses.replace(one, places=None) for one in sightings.values()],
+                site.bounds_m, *site.users).fix != fix
+    source = m.Grant(cycle_id=1, user=2)
+    answers = [posterior_of(source, one, codebook_id='x',
+                            scenario_id=site.surfaces[name].scenario.id)
+               for name, one in sightings.items()]
+    for name, one in zip(sightings, answers, strict=True):
+        m.check(one, site.surfaces[name].scenario)
+    _, (found, *_) = at_once(Fusion(site, lambda: 0.0), answers)
+    if not fix:
+        assert found.reason == expected.reason
+        return
+    assert found.outside_probability == pytest.approx(expected.outside_probability, rel=1e-9)
+    np.testing.assert_allclose(found.position, expected.mean, rtol=1e-9)
+    np.testing.assert_allclose(found.covariance_m2, expected.covariance, rtol=1e-9)
+
+
+def test_a_message_holds_the_places_of_a_user_outside_unless_they_are_unknown(
+        answer, small_site):
+    assert sighting_of(answer('side')).places is None
+    site, estimator = small_site
+    sighting = estimator.sightings({name: shots[0] for name, shots in site.sample(
+        PLACE[None], np.random.default_rng(0)).items()})['side']
+    found = sighting_of(posterior_of(
+        m.Grant(cycle_id=1, user=2), sighting, codebook_id='x')).places
+    assert found[1:] == sighting.places[1:]
+    assert len(found.gaussians.means) > 1
+    for one, other in zip(found.gaussians, sighting.places.gaussians, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_cycle_with_all_surfaces_is_fused_at_once(fusion, site, answer):

@@ -133,11 +133,18 @@ def test_a_number_out_of_range_is_named(error_of, kind, field):
             f'{field.name}: {bad}, expected {declared.range}')
 
 
+def skewed(matrices):
+    """Add 1 above the diagonal of the first of several matrices."""
+    matrices[0, 0, 1] += 1.0
+
+
 SYMBOLS = {size: np.array([1, size * 1j]) for size in (0.0, 0.98, 0.99, 1.0, 1.01, 1.02)}
 VALID = [(m.Pilot, {'symbols': SYMBOLS[size]}) for size in (0.99, 1.0, 1.01)]
 VALID += [(kind, {'position': np.array([1e6, -1e6, 0])})
           for kind in (m.PositionEstimate, m.GroundTruth)]
-VALID += [(m.Posterior, {'means': np.ones((2, 6)), 'covariances_m2': np.stack([np.eye(6)] * 2)})]
+VALID += [(m.Posterior, {'means': np.ones((2, 6)), 'covariances_m2': np.stack([np.eye(6)] * 2)}),
+          (m.Posterior, {'outside_log_weights': np.zeros(0), 'outside_means': np.zeros((0, 3)),
+                         'outside_covariances_m2': np.zeros((0, 3, 3))})]
 VALID += [(kind, {'analog': sets(1.0, 0.0)}) for kind in (m.RhsConfiguration, m.Beam)]
 MALFORMED = [
     (m.FeedSignals, {'signals': np.zeros((3, 3, 2))},
@@ -156,21 +163,31 @@ MALFORMED = [
     *((kind, {'position': np.array([1.1e6, 0, 0])}, 'position: 0 to 1.1e+06')
       for kind in (m.PositionEstimate, m.GroundTruth)),
     (m.Posterior, {'covariances_m2': np.stack([np.eye(3), np.diag([1.0, 1.0, 0.0])])},
-     'eigenvalue 0, expected positive eigenvalues'),
-    (m.Posterior, {'means': -np.ones((2, 3))}, 'means: x = -1 m, expected x > 0'),
+     'eigenvalue 0, asymmetry 0, expected symmetric matrices with positive eigenvalues'),
+    *((m.Posterior, {name: sets(value)}, f'{name}: eigenvalue {reason}') for name in (
+        'covariances_m2', 'sheet_covariances', 'outside_covariances_m2')
+      for value, reason in ((-1.0, '-1, asymmetry 0, expected'), (0.0, '0, asymmetry 0'))),
+    *((m.Posterior, {name: skewed}, 'asymmetry 1, expected symmetric matrices') for name in (
+        'covariances_m2', 'sheet_covariances', 'outside_covariances_m2')),
+    *((m.Posterior, {name: sets(-1.0)}, f'{name}: x = -1 m, expected x > 0') for name in (
+        'means', 'outside_means')),
     (m.Posterior, {'means': np.zeros((3, 3))}, 'expected [COMPONENTS = 2, D = 3]'),
     (m.Posterior, {'covariances_m2': np.stack([np.eye(6)] * 2)},
      'expected [COMPONENTS = 2, D = 3, D = 3]'),
     (m.Posterior, {'surface_quaternion': np.zeros(4)}, 'a length other than 0'),
     (m.Posterior, {'surface_uncertainty': -np.eye(6)}, 'without negative eigenvalues'),
-    (m.Posterior, {'log_weights': np.zeros(257), 'means': np.zeros((257, 3)),
-                   'covariances_m2': np.tile(np.eye(3), (257, 1, 1))}, 'expected at most 256'),
+    *((m.Posterior, {f'{part}log_weights': np.zeros(n), f'{part}means': np.ones((n, 3)),
+                     f'{part}{covariances}': np.tile(np.eye(3), (n, 1, 1))},
+       f'{n} components, expected {fewest} to 256')
+      for part, covariances, n, fewest in (
+          ('', 'covariances_m2', 0, 1), ('', 'covariances_m2', 257, 1),
+          ('sheet_', 'covariances', 257, 0), ('outside_', 'covariances_m2', 257, 0))),
     # The position of a later frame would be beyond all that the model computes.
     *((kind, {'velocity': sets(-3e8)}, 'velocity: -3e+08') for kind in (
         m.GroundTruth, m.GroundTruths)),
     (m.PositionEstimate, {'covariance_m2': np.eye(3) * 1e13}, 'covariance_m2: 0 to 1e+13'),
-    (m.Posterior, {'sheet_means': np.full((1, 3), 1e7), 'sheet_log_weights': np.zeros(1),
-                   'sheet_covariances': np.eye(3)[None]}, 'sheet_means: 1e+07 to 1e+07'),
+    *((m.Posterior, {name: np.full((1, 3), 1e7)}, f'{name}: 1e+07 to 1e+07') for name in (
+        'sheet_means', 'outside_means')),
     (m.GroundTruth, {'position': np.array([5.0, 1j, 0.0])}, 'expected real numbers'),
     (m.GroundTruth, {'position': np.ma.array([5.0, 1.0, 0.0], mask=[0, 1, 0])},
      'expected real numbers'),
