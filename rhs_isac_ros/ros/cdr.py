@@ -188,6 +188,9 @@ class Codec:
                 items.append(scenario_id)
             else:
                 items.append(_flushed(value))
+        return self._packed(items)
+
+    def _packed(self, items: Sequence[Any]) -> bytes:
         pieces = [HEADER]
         position, first = len(HEADER), 0
         for layouts, n_items, tail in self._runs:
@@ -256,6 +259,32 @@ class Codec:
         vars(message).update(fields)
         return message
 
+    def extension(self, n_fields: int) -> Callable[[bytes], bytes] | None:
+        """Return a function that adds the fields after the first `n_fields` to a message.
+
+        The header is the first field. The function takes and returns bytes, and returns those that
+        are no message unchanged. The added fields have the defaults of the dataclass; if one of
+        them has none, there is no function.
+        """
+        defaults = {field.name: field for field in dataclasses.fields(self._kind)}
+        added: list[tuple[_Field, Sequence[Any]]] = []
+        for one in self._fields[max(n_fields, 1) - 1:]:
+            value = _default(defaults[one.name])
+            if value is dataclasses.MISSING:
+                return None
+            added.append((one, [value] if one.encode is None else one.encode(value)))
+
+        def extend(data: bytes) -> bytes:
+            try:
+                # A number or a size, and padding, of each item are at most 16 bytes.
+                items = self._items(data + bytes(16 * sum(len(values) for _, values in added)))
+            except (struct.error, ValueError):
+                return data
+            for one, values in added:
+                items[one.first:one.last] = values
+            return self._packed(items)
+        return extend
+
     def _items(self, data: bytes) -> list[Any]:
         items: list[Any] = []
         position = len(HEADER)
@@ -282,6 +311,12 @@ class Codec:
             else:
                 items.append(_NONE)
         return items
+
+
+def _default(field: Any) -> Any:
+    """Return the default of a field of a dataclass, or `dataclasses.MISSING`."""
+    return (field.default if field.default_factory is dataclasses.MISSING
+            else field.default_factory())
 
 
 def _runs(wire: Sequence[str]) -> list[_Run]:

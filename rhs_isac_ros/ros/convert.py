@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numpy as np
@@ -83,6 +84,16 @@ def from_bytes(kind: type[_MessageT], serialized: bytes) -> _MessageT:
     deserialize.
     """
     return _CODECS[kind].decode(serialized)
+
+
+def extension(own: type, n_fields: int) -> Callable[[bytes], bytes] | None:
+    """Return a function that adds the last fields to serialized messages of an earlier version.
+
+    `own` is a ROS type, of which the messages have the first `n_fields`; see
+    `cdr.Codec.extension`.
+    """
+    codec = next((codec for kind, codec in _CODECS.items() if _ROS_TYPES[kind] is own), None)
+    return codec.extension(n_fields) if codec else None
 
 
 def deserialize(content: bytes, kind: type) -> Any:

@@ -220,11 +220,12 @@ def read(
 
     The messages are sorted by time; copies of a recording may have them in another order. The
     known types are those of `recorded_topics`. `names`, if given, selects topics by full name.
-    Raises RecordingError if the file cannot be read, or a type differs from the installed one.
+    Fields that the installed type has after those of the recorded one are 0 or empty. Raises
+    RecordingError if the file cannot be read, or a type differs otherwise.
     """
     kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}
     known: dict[tuple[str, int], Any] = {}
-    checked: set[int] = set()
+    converted: dict[int, Callable[[bytes], bytes]] = {}
     messages: list[tuple[str, bytes, int]] = []
     for record in _records(path):
         what = type(record).__name__
@@ -238,23 +239,29 @@ def read(
         if (found is None or found.name not in kinds
                 or names is not None and channel.topic not in names):
             continue
-        if found.id not in checked:
-            _check_schema(path, found, kinds[found.name])
-            checked.add(found.id)
-        messages.append((channel.topic, record.data, record.log_time))
+        if found.id not in converted:
+            converted[found.id] = _conversion(path, found, kinds[found.name])
+        messages.append((channel.topic, converted[found.id](record.data), record.log_time))
     messages.sort(key=lambda message: message[2])
     yield from ((topic, content, 1e-9 * time_ns) for topic, content, time_ns in messages)
 
 
-def _check_schema(path: str | Path, found: Any, kind: type) -> None:
+def _conversion(path: str | Path, found: Any, kind: type) -> Callable[[bytes], bytes]:
+    """Return a function that converts messages with a recorded schema to the installed type."""
     if found.encoding != 'ros2msg':
-        return
+        return bytes
     recorded = _definitions(found.name, found.data.decode(errors='replace'))
-    for name, fields in _definitions(found.name, schema(kind)).items():
-        if recorded.get(name, fields) != fields:
-            raise RecordingError(
-                f'{path}: {name}: recorded with other fields than the installed message has; '
-                'expected a recording of this version')
+    (owner, fields), *parts = _definitions(found.name, schema(kind)).items()
+    before = recorded[owner]
+    other = next((name for name, part in parts if recorded.get(name, part) != part), '')
+    if not other and before == fields:
+        return bytes
+    if not other and before == fields[:len(before)] and (
+            extension := convert.extension(kind, len(before))):
+        return extension
+    raise RecordingError(
+        f'{path}: {other or owner}: recorded with other fields than the installed message has; '
+        'expected the same, or all but the last ones that have defaults')
 
 
 def _definitions(name: str, text: str) -> dict[str, list[tuple[str, str]]]:

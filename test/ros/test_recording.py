@@ -26,12 +26,14 @@ from rclpy.qos import (
     ReliabilityPolicy,
 )
 from rclpy.serialization import deserialize_message
-from ros_messages import to_ros
+from ros_messages import from_ros, to_ros
 
 import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.nodes.transmission import TransmissionNode
+from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.protocol.presences import Presence
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import ACKS, EXCHANGE
 from rhs_isac_ros.ros.observer import CycleObserver
@@ -295,7 +297,40 @@ def rewritten(path, change, **options):
     return copy
 
 
+# One message of each topic of a network of version 1.0.0, and a posterior of a later one, in which
+# posteriors did not have the fields of `Places`.
+EARLIER = Path(__file__).parents[1] / 'data' / 'earlier_versions.mcap'
+
+
+def test_messages_of_earlier_versions_have_the_defaults_of_fields_that_have_come_since():
+    kinds = {name: kind for kind, name in topics.NAMES.items()} | {
+        'codebook': convert.CodebookMessage, 'presence': Presence}
+    contents = {topic.removeprefix('/'): content for topic, content, _ in read(EARLIER)}
+    # The network had no user outside, and its users were in nodes of their own.
+    assert kinds.keys() - contents.keys() == {'no_fix', 'ground_truths'}
+    found = {name: convert.from_bytes(kinds[name], one) for name, one in contents.items()}
+    posterior, presence, estimate = (
+        found[name] for name in ('posterior', 'presence', 'position_estimate'))
+    assert (posterior.user, posterior.misfit_log_ratio, posterior.sheet_means.tolist()) == (
+        2, -2.0, [[8.0, -0.25, 0.0]])
+    assert (posterior.outside_means.shape, posterior.outside_range_m) == ((0, 3), 0.0)
+    assert (presence.role, presence.use_sim_time, presence.library_id) == ('positioner', False, '')
+    assert (estimate.estimator, estimate.next_codebook_id, estimate.next_codebook_s) == (
+        'bayes', '', 0.0)
+    assert estimate.position == pytest.approx([11.938, 1.588, 0.347], abs=1e-3)
+    scenario = read_networks(EARLIER).scenario
+    for name, message in found.items():
+        if isinstance(message, m.Message):
+            m.check(message, scenario)
+        # They are whole messages, which may be published.
+        whole = deserialize_message(contents[name], convert.ros_type(kinds[name]))
+        assert convert.to_bytes(from_ros(kinds[name], whole), 0) == convert.to_bytes(message, 0)
+
+
 @pytest.mark.parametrize(('old', 'new', 'owner'), [
+    ('ComplexArray signals.*\n', '', 'ReceivedSignals'),
+    (r'float64\[] im.*\n', '', 'ComplexArray'),
+    ('(?s).*', '', 'ReceivedSignals'),
     ('uint64 sender.*\n', '', 'ReceivedSignals'),
     ('uint64 sender', 'int64 sender', 'ReceivedSignals'),
     (r'float64\[] im', 'float32[] im', 'ComplexArray')])
