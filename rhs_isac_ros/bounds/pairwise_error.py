@@ -50,10 +50,9 @@ class PairwiseErrorCost(Average):
             raise ValueError(
                 f'second_positions: {len(second_positions)} positions, expected as many as '
                 f'first_positions, {n}, and at least one')
-        weights = np.ones(n) if weights is None else numbers('weights', weights)
-        if weights.shape != (n,) or not (weights >= 0).all():
-            raise ValueError(
-                f'weights: shape {weights.shape}, expected {(n,)}, none negative or NaN')
+        weights = np.ones(n) if weights is None else numbers('weights', weights, shapes=[(n,)])
+        if weights.min() < 0:
+            raise ValueError(f'weights: {weights.min():g}, expected none below 0')
         self._costs = weights * np.sum((first_positions - second_positions)**2, axis=1)
         self._scales, self._precision = nuisance_of(scenario).scaled_phases
 

@@ -59,13 +59,13 @@ class Codebook:
 
     def __post_init__(self) -> None:
         """Copy the arrays, check them, and make them read-only."""
-        for name, kind, dims in (('analog', float, 'N_B, F, N_E'),
-                                 ('digital', complex, 'N_B, N_SB, F, K')):
+        for name, kind, shape in (('analog', float, ('N_B', 'F', 'N_E')),
+                                  ('digital', complex, ('N_B', 'N_SB', 'F', 'K'))):
             # A copy, which the caller cannot change.
             array = np.array(numbers(
-                name, getattr(self, name), kind, CodebookError, shape=f'[{dims}]'), order='C')
-            if array.ndim != len(dims.split(',')) or 0 in array.shape:
-                raise CodebookError(f'{name}: shape {array.shape}, expected [{dims}]')
+                name, getattr(self, name), kind, CodebookError, shapes=[shape]), order='C')
+            if not array.size:
+                raise CodebookError(f'{name}: shape {array.shape}, expected sizes from 1')
             object.__setattr__(self, name, read_only(array))
         if self.analog.min() < 0 or self.analog.max() > 1:
             raise CodebookError(

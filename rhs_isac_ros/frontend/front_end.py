@@ -12,6 +12,8 @@ import numpy as np
 from rhs_isac_ros.frontend.radio import Air, Radio, RadioFault, Sounding
 from rhs_isac_ros.frontend.sigmf_recording import SampleRecorder
 from rhs_isac_ros.frontend.surface import Surface
+from rhs_isac_ros.model.arrays import numbers
+from rhs_isac_ros.support.errors import translated
 
 
 class FrontEnd:
@@ -77,11 +79,7 @@ class FrontEnd:
     def _receive(self, sounding: Sounding, captures: list[np.ndarray], times_s: np.ndarray
                  ) -> np.ndarray:
         # The captures may have any size.
-        try:
-            feeds = self._radio.modem.receive(
-                sounding.cycle_id, np.array(captures), sounding.symbols, sounding.band, times_s)
-        except ValueError as error:
-            raise RadioFault(str(error)) from error
-        if feeds.shape != sounding.arriving.shape or not np.isfinite(feeds).all():
-            raise RadioFault(f'signals {feeds.shape}, expected finite {sounding.arriving.shape}')
-        return feeds
+        with translated(ValueError, RadioFault):
+            return numbers('signals', self._radio.modem.receive(
+                sounding.cycle_id, np.array(captures), sounding.symbols, sounding.band, times_s),
+                complex, shapes=[sounding.arriving.shape])

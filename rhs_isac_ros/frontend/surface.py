@@ -79,9 +79,7 @@ def checked(configuration: ArrayLike, n_elements: int, is_binary: bool = False) 
 
     Its coefficients are from 0 to 1, or either of them if `is_binary` is set.
     """
-    values = np.array(numbers('configuration', configuration, shape=f'({n_elements},)'))
-    if values.shape != (n_elements,):
-        raise ValueError(f'configuration: shape {values.shape}, expected ({n_elements},)')
+    values = np.array(numbers('configuration', configuration, shapes=[(n_elements,)]))
     is_valid = (values == 0) | (values == 1) if is_binary else (0 <= values) & (values <= 1)
     if not is_valid.all():
         element = int(np.argmin(is_valid))

@@ -111,12 +111,8 @@ def posterior_points(
     positions, float64 [n, 3] [m], and weights with the sum 1, float64 [n]. Raises ValueError if
     `mean` or `covariance` has a wrong shape or is not finite.
     """
-    mean, covariance = (numbers(name, value, finite=False) for name, value in (
-        ('mean', mean), ('covariance', covariance)))
-    for name, value, shape in (('mean', mean, (3,)), ('covariance', covariance, (3, 3))):
-        if value.shape != shape or not np.isfinite(value).all():
-            raise ValueError(f'{name}: {value}, expected {list(shape)} finite numbers')
-    checked_position(mean, 'mean')
+    mean = checked_position(mean, 'mean')
+    covariance = numbers('covariance', covariance, shapes=[(3, 3)])
     # Halve before adding: the sum of two numbers near the largest float is infinite.
     variances, axes = np.linalg.eigh(np.divide(covariance, 2) + np.divide(covariance, 2).T)
     spreads = np.minimum(np.sqrt(np.maximum(variances, 0)), _MAX_SPREAD_M)
@@ -139,15 +135,15 @@ def _standard_rule(varies: tuple[bool, ...]) -> tuple[np.ndarray, np.ndarray]:
 
 def _radiation(scenario: Scenario, beam: Beamformer) -> np.ndarray:
     """Return the radiation t_j = c . (s_j B_j) of the elements, complex128 [N_SB, N_E]."""
-    check_shape('analog', beam.analog, 'N_E', scenario)
-    check_shape('digital', beam.digital, 'N_SB K', scenario)
+    analog, digital = numbers('analog', beam.analog), numbers('digital', beam.digital, complex)
+    check_shape('analog', analog, 'N_E', scenario)
+    check_shape('digital', digital, 'N_SB K', scenario)
     if not 0 <= beam.band < scenario.n_bands:
         raise ValueError(f'band: {beam.band}, expected 0 to {scenario.n_bands - 1}')
     slope, offset, gain = beam.response
-    digital = numbers('digital', beam.digital, complex)
     return scenario.board.radiation(
-        ports_of(scenario, beam.band), numbers('analog', beam.analog)[None, None],
-        gain * digital[None, :, None], slope, offset)[0, :, 0]
+        ports_of(scenario, beam.band), analog[None, None], gain * digital[None, :, None], slope,
+        offset)[0, :, 0]
 
 
 def _rate(scenario: Scenario, power_w: np.ndarray) -> np.ndarray:

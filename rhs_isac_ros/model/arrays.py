@@ -2,7 +2,7 @@
 
 import functools
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -111,16 +111,41 @@ def all_finite(values: np.ndarray) -> bool:
         np.isfinite(values).all())
 
 
-def numbers(name: str, value: ArrayLike, kind: type = float,
-            error: type[ValueError] = ValueError, *, shape: str = '', finite: bool = True
-            ) -> np.ndarray:
+def numbers(name: str, value: ArrayLike, kind: type | None = float,
+            error: type[ValueError] = ValueError, *, shapes: Sequence[tuple[int | str, ...]] = (),
+            finite: bool = True) -> np.ndarray:
     """Convert numbers to an array of `kind`: float, complex or int; else raise `error`.
 
+    Without a kind, the array is complex if the numbers are, else float.
+
     NumPy drops masks and some imaginary parts, and converts text and objects, without an error.
-    `shape` describes the expected shape in errors. If `finite` is set, all must be finite.
+    If `shapes` are given, the array must have one of them. In a shape, a text stands for any size,
+    and ``'...'`` at the beginning for any number of axes. If `finite` is set, all numbers must be
+    finite.
     """
-    if type(value) is np.ndarray and value.dtype == kind and all_finite(value):
-        return value
+    kinds = (kind,) if kind else (float, complex)
+    array = value if type(value) is np.ndarray and value.dtype in kinds and all_finite(
+        value) else _converted(name, value, kind, error, _listed(shapes), finite)
+    if shapes and not any(_fits(array.shape, shape) for shape in shapes):
+        raise error(f'{name}: shape {array.shape}, expected {_listed(shapes)}')
+    return array
+
+
+def _listed(shapes: Sequence[tuple[int | str, ...]]) -> str:
+    return ' or '.join(
+        f'[{", ".join(map(str, shape))}]' if shape else 'a number' for shape in shapes)
+
+
+def _fits(sizes: tuple[int, ...], shape: tuple[int | str, ...]) -> bool:
+    if shape[:1] == ('...',):
+        sizes, shape = sizes[max(len(sizes) + 1 - len(shape), 0):], shape[1:]
+    return len(sizes) == len(shape) and all(
+        expected == size or isinstance(expected, str)
+        for size, expected in zip(sizes, shape, strict=True))
+
+
+def _converted(name: str, value: ArrayLike, kind: type | None, error: type[ValueError],
+               shape: str, finite: bool) -> np.ndarray:
     expected = f'expected numbers {shape}'.rstrip()
     if _is_masked(value):
         raise error(f'{name}: a masked array, {expected} without a mask')
@@ -128,6 +153,7 @@ def numbers(name: str, value: ArrayLike, kind: type = float,
         array = np.asarray(value)
     except (TypeError, ValueError) as problem:
         raise error(f'{name}: {problem}, {expected}') from None
+    kind = kind or (complex if array.dtype.kind == 'c' else float)
     if array.dtype.kind == 'c' and kind is not complex:
         raise error(f'{name}: complex numbers, expected real numbers {shape}'.rstrip())
     if array.dtype.kind not in 'bifuc':
@@ -159,7 +185,7 @@ def position_problem(positions: np.ndarray) -> str:
 
 def checked_positions(positions: ArrayLike) -> np.ndarray:
     """Return positions in front of the surface as float64 [N, 3] [m], or raise ValueError."""
-    return _checked('positions', positions, 2, '[N, 3]')
+    return _checked('positions', positions, ('N', 3))
 
 
 def checked_states(states: ArrayLike) -> np.ndarray:
@@ -167,15 +193,15 @@ def checked_states(states: ArrayLike) -> np.ndarray:
 
     Raises ValueError as `checked_positions`, and if a velocity is not finite.
     """
-    array = numbers('positions', states)
-    checked_positions(array[:, :3] if array.ndim == 2 and array.shape[1] == 6 else array)
+    array = numbers('positions', states, shapes=[('N', 3), ('N', 6)])
+    checked_positions(array[:, :3])
     return array
 
 
 def checked_bounds(bounds_m: ArrayLike) -> np.ndarray:
     """Return the lower and the upper corner of a box, float64 [2, 3] [m], or raise ValueError."""
-    array = numbers('bounds_m', bounds_m)
-    if array.shape != (2, 3) or (array[0] > array[1]).any():
+    array = numbers('bounds_m', bounds_m, shapes=[(2, 3)])
+    if (array[0] > array[1]).any():
         raise ValueError(f'bounds_m: {array.tolist()}, expected the lower and the upper corner of '
                          'a box, [2, 3]')
     return array
@@ -183,13 +209,11 @@ def checked_bounds(bounds_m: ArrayLike) -> np.ndarray:
 
 def checked_position(position: ArrayLike, name: str = 'position') -> np.ndarray:
     """Return a position in front of the surface as float64 [3] [m], or raise ValueError."""
-    return _checked(name, position, 1, '[3]')
+    return _checked(name, position, (3,))
 
 
-def _checked(name: str, value: ArrayLike, n_axes: int, expected: str) -> np.ndarray:
-    array = numbers(name, value)
-    if array.ndim != n_axes or array.shape[-1] != 3:
-        raise ValueError(f'{name}: shape {array.shape}, expected {expected}')
+def _checked(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> np.ndarray:
+    array = numbers(name, value, shapes=[shape])
     if problem := position_problem(array):
         raise ValueError(f'{name}: {problem}')
     return array
@@ -199,6 +223,4 @@ def check_arrays(owner: Any, shapes: Mapping[str, tuple[int, ...]],
                  error: type[ValueError] = ValueError) -> None:
     """Raise `error` unless `owner` has finite attributes with the names and shapes in `shapes`."""
     for name, shape in shapes.items():
-        array = numbers(name, getattr(owner, name), complex, error)
-        if array.shape != shape:
-            raise error(f'{name}: shape {array.shape}, expected {shape}')
+        numbers(name, getattr(owner, name), complex, error, shapes=[shape])

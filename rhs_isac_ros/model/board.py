@@ -14,11 +14,12 @@ import dataclasses
 import functools
 import hashlib
 import json
+from collections.abc import Callable
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import adjoint
+from rhs_isac_ros.model.arrays import adjoint, numbers
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import Field
@@ -37,6 +38,7 @@ class BoardError(ValueError):
 class Ports:
     """What a transfer depends on apart from the tunings."""
 
+    bands: tuple[int, ...]  #: Indices of the bands.
     frequencies_hz: np.ndarray  #: Frequencies of the sub-bands, float64 [B, J].
     elements_m: np.ndarray  #: Positions of the elements, float64 [N_E, 3].
     feeds_m: np.ndarray  #: Positions of the feeds, float64 [K, 3].
@@ -65,6 +67,12 @@ class Board(abc.ABC):
     kind: str  #: Name in a scenario file.
     #: Whether the coefficient of an element is its tuning, apart from a constant factor.
     is_amplitude: ClassVar[bool] = False
+
+    def __init_subclass__(cls) -> None:
+        """Let methods raise BoardError if their results have wrong shapes, types or values."""
+        for name in ('transfer', 'pullback', 'coefficients', 'slopes'):
+            if name in vars(cls):
+                setattr(cls, name, _checked(name, vars(cls)[name]))
 
     def __post_init__(self) -> None:
         """Convert the fields declared with `limited`; raise BoardError if one is out of range."""
@@ -113,10 +121,10 @@ class Board(abc.ABC):
     @functools.cached_property
     def plain(self) -> str | dict[str, Any]:
         """The value that `board_of` converts to an equal board."""
-        changed = {
-            field.name: _lists(getattr(self, field.name))
-            for field in dataclasses.fields(self)  # type: ignore[arg-type]
-            if getattr(self, field.name) != field.default}
+        fields: tuple[dataclasses.Field[Any], ...] = (
+            dataclasses.fields(self) if dataclasses.is_dataclass(self) else ())
+        changed = {field.name: _lists(getattr(self, field.name)) for field in fields
+                   if getattr(self, field.name) != field.default}
         return {'kind': self.kind, **changed} if changed else self.kind
 
     @property
@@ -190,6 +198,24 @@ class Board(abc.ABC):
         tunings = np.broadcast_to(levels[:, None], (1, len(levels), los.shape[-1]))
         gains = np.mean(self.coefficients(ports, tunings)[0], axis=0)
         return levels[(gains * interference).real.argmax(axis=0)]
+
+
+def _checked(name: str, method: Callable[..., Any]) -> Callable[..., np.ndarray]:
+    """Return a method of a board, with a name, that checks its result."""
+    @functools.wraps(method)
+    def checked(self: Board, ports: Ports, tunings: np.ndarray, *others: np.ndarray
+                ) -> np.ndarray:
+        found = method(self, ports, tunings, *others)
+        (n_bands, n_subbands), frames = ports.frequencies_hz.shape, tunings.shape[1:]
+        coefficients = [(n, m, *frames) for n in (n_bands, len(tunings)) for m in (n_subbands, 1)]
+        shapes: dict[str, list[tuple[int, ...]]] = {
+            'transfer': [(n_bands, n_subbands, *frames, len(ports.feeds_m))],
+            'pullback': [(n_bands, *frames)],
+            'coefficients': coefficients, 'slopes': [*coefficients, frames[1:], ()]}
+        return numbers(f'{type(self).__name__}.{name}', found,
+                       float if name == 'pullback' else None, BoardError,
+                       shapes=[*dict.fromkeys(shapes[name])])
+    return checked
 
 
 def rounded(tunings: np.ndarray, n_levels: int) -> np.ndarray:

@@ -59,7 +59,7 @@ class Elementwise(Board):
 
     @abc.abstractmethod
     def slopes(self, ports: Ports, tunings: np.ndarray) -> np.ndarray | float:
-        """Return the derivative of `coefficients` by the tunings."""
+        """Return the derivative of `coefficients` by the tunings: as these, [N_E] or a number."""
 
     @functools.lru_cache(maxsize=64)  # noqa: B019 - boards are few, and equal ones share entries
     def paths(self, ports: Ports) -> np.ndarray:
@@ -202,7 +202,8 @@ class Resonant(Elementwise):
         """Return f_r relative to the frequency, float64 [B, J, 1, 1]."""
         frequencies = ports.frequencies_hz[..., None, None]
         return (frequencies.mean(axis=1, keepdims=True) if self.resonances_hz is None
-                else np.reshape(self.resonances_hz, (-1, 1, 1, 1))) / frequencies
+                else np.reshape(self.resonances_hz, (-1, 1, 1, 1))[list(ports.bands)]
+                ) / frequencies
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -255,14 +256,19 @@ class States(Elementwise):
     def coefficients(self, ports: Ports, tunings: np.ndarray) -> np.ndarray:
         """Return the interpolated states, complex128 [B, 1, Q, N_E]."""
         position = tunings[:, None] * (len(self._table) - 1)
-        return np.sum(np.maximum(1 - np.abs(position - self._numbers), 0) * self._table, axis=0)
+        return np.sum(np.maximum(1 - np.abs(position - self._numbers), 0) * self._states(ports),
+                      axis=0)
 
     def slopes(self, ports: Ports, tunings: np.ndarray) -> np.ndarray | float:
         """Return the differences between neighbouring states, times L - 1."""
         last = len(self._table) - 1
         below = np.clip(np.floor(tunings[:, None] * last), 0, last - 1)
-        steps = np.diff(self._table, axis=0) * last
+        steps = np.diff(self._states(ports), axis=0) * last
         return np.sum((below == self._numbers[:-1]) * steps, axis=0)
+
+    def _states(self, ports: Ports) -> np.ndarray:
+        # A table for all bands has a single row of them.
+        return np.take(self._table, ports.bands, axis=1, mode='clip')
 
     @functools.cached_property
     def _numbers(self) -> np.ndarray:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import digest
+from rhs_isac_ros.model.arrays import digest, numbers
 from rhs_isac_ros.model.external import External
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.errors import translated
@@ -99,14 +99,8 @@ def _evaluate(function: AngleFunction, angles: np.ndarray) -> np.ndarray:
     # A function that the user supplies may raise any exception.
     try:
         given = function(angles)
-        result = np.asarray(given)
     except Exception as error:
         raise PatternError(
             f'{function!r}: {type(error).__name__}: {error}, expected a function of an array of '
             'angles [rad]') from error
-    if (result.shape != np.shape(angles) or result.dtype.kind not in 'fiu'
-            or isinstance(given, np.ma.MaskedArray)):
-        raise PatternError(
-            f'{function!r}: {type(given).__name__} of {result.dtype} {result.shape}, expected '
-            f'real numbers of the shape of the angles, {np.shape(angles)}')
-    return result.astype(float, copy=False)
+    return numbers(repr(function), given, error=PatternError, shapes=[np.shape(angles)])

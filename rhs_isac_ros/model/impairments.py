@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import adjoint, check_arrays, read_only
+from rhs_isac_ros.model.arrays import adjoint, numbers, read_only
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.model.elements import ElementErrors, draw_surface, has_errors
 from rhs_isac_ros.model.geometry import frame_lags_s, subband_frequencies_hz
@@ -78,7 +78,7 @@ class Impairment:
 
     def values(self, scenario: Scenario, white: np.ndarray) -> np.ndarray:
         """Map standard normal numbers [n, q] to values of n independent draws, [n, q]."""
-        return white @ self.linear(scenario).root.T
+        return white @ np.transpose(self.linear(scenario).root)
 
 
 class Exponents:
@@ -322,7 +322,7 @@ def impairments_of(scenario: Scenario) -> tuple[Impairment, ...]:
 def nuisance_of(scenario: Scenario) -> Nuisance:
     """Return the nuisance parameters of all impairments that a scenario declares.
 
-    Raises PluginError if exponents or a covariance have wrong shapes, or are not finite.
+    Raises PluginError if an impairment has no valid exponents, covariance or scope.
     """
     return _nuisance(scenario, _given(scenario))
 
@@ -337,10 +337,14 @@ def _nuisance(scenario: Scenario, given: tuple[Any, ...]) -> Nuisance:
     parts = []
     for one in impairments_of(scenario):
         linear = one.linear(scenario)
-        n = len(linear.patterns)
-        with translated(ValueError, plugins.PluginError, f'{type(one).__name__}.linear'):
-            check_arrays(linear, {'patterns': (n, *_shape(scenario)), 'root': (n, n)})
-        parts.append(linear)
+        with translated(ValueError, plugins.PluginError, type(one).__name__):
+            if not isinstance(linear, Linear) or not isinstance(one.scope, Scope):
+                raise ValueError(f'linear: {linear!r}, scope: {one.scope!r}, expected a Linear '
+                                 'and a Scope')
+            patterns = numbers('patterns', linear.patterns, complex,
+                               shapes=[('q', *_shape(scenario))])
+            root = numbers('root', linear.root, shapes=[(len(patterns), len(patterns))])
+        parts.append(linear._replace(patterns=patterns, root=root))
     return Nuisance(scenario, parts)
 
 
@@ -363,8 +367,10 @@ def draw_factors(
             members = [one for one in group if one.scope is scope]
             sizes = [len(one.linear(scenario).root) for one in members]
             white = np.split(rng.standard_normal((n, sum(sizes))), np.cumsum(sizes), axis=1)
-            values |= {id(one): one.values(scenario, part)
-                       for one, part in zip(members, white, strict=False) if one in declared}
+            values |= {id(one): numbers(
+                f'{type(one).__name__}.values', one.values(scenario, part),
+                error=plugins.PluginError, shapes=[part.shape])
+                for one, part in zip(members, white, strict=False) if one in declared}
     return nuisance.factors(
         np.concatenate([values[id(one)] for one in declared], axis=1))
 

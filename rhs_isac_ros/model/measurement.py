@@ -19,6 +19,7 @@ from rhs_isac_ros.model.arrays import (
     checked_positions,
     checked_states,
     multiply_rows,
+    numbers,
     read_only,
 )
 from rhs_isac_ros.model.compression import (
@@ -329,7 +330,12 @@ class MeasurementModel:
         return combine_subbands(self._functions, signals)
 
     def whiten(self, signals: np.ndarray) -> np.ndarray:
-        """Transform signals [..., N_B, N_SB F] to unit covariance, [..., N_B, n]."""
+        """Transform signals [..., N_B, N_SB F] to unit covariance, [..., N_B, n].
+
+        Raises ValueError for anything but numbers of this shape.
+        """
+        signals = numbers(
+            'signals', signals, complex, shapes=[('...', *self.shape)], finite=False)
         return multiply_rows(self.combined_whitener, self.combine(signals))
 
     def mean(self, positions: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rhs_isac_ros.model.arrays import checked_position, checked_positions
+from rhs_isac_ros.model.arrays import checked_position, checked_positions, numbers
 from rhs_isac_ros.model.hall import PathChannel
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.support import plugins
@@ -57,6 +57,19 @@ class StraightMobility(Mobility, Protocol):
         return leg.origin + leg.velocity * (now_s - leg.departure_s), leg.velocity.copy()
 
 
+def state_of(mobility: Mobility, now_s: float) -> np.ndarray:
+    """Return position and velocity at a time, float64 [2, 3]; see `Mobility.state`.
+
+    Raises PluginError if the mobility returns anything else.
+    """
+    return _vectors(mobility, 'state', mobility.state(now_s))
+
+
+def _vectors(mobility: Mobility, method: str, found: Any) -> np.ndarray:
+    return numbers(f'{type(mobility).__name__}.{method}', found, error=plugins.PluginError,
+                   shapes=[(2, 3)])
+
+
 class Crowd:
     """The paths of many users; all straight legs are evaluated in one array operation."""
 
@@ -78,12 +91,16 @@ class Crowd:
         for user in np.flatnonzero(now_s >= self._end_s).tolist():
             mobility = self._mobilities[user]
             if isinstance(mobility, StraightMobility):
-                (self._origin[user], self._velocity[user], self._departure_s[user],
-                 self._end_s[user]) = mobility.leg(now_s)
+                leg = mobility.leg(now_s)
+                if not isinstance(leg, Leg) or not leg.departure_s <= now_s < leg.end_s:
+                    raise plugins.PluginError(
+                        f'{type(mobility).__name__}.leg: {leg!r}, expected a Leg at {now_s} s')
+                self._origin[user], self._velocity[user] = _vectors(mobility, 'leg', leg[:2])
+                self._departure_s[user], self._end_s[user] = leg[2:]
         velocity = self._velocity.copy()
         position = self._origin + velocity * (now_s - self._departure_s)[:, None]
         for user in self._others.tolist():
-            position[user], velocity[user] = self._mobilities[user].state(now_s)
+            position[user], velocity[user] = state_of(self._mobilities[user], now_s)
         return position, velocity
 
 
@@ -159,7 +176,7 @@ class Traced:
 
     def state(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the moved position [3] [m], and the velocity [3] [m/s] of the other mobility."""
-        position, velocity = self._mobility.state(now_s)
+        position, velocity = state_of(self._mobility, now_s)
         return self._channel.users[self._channel.nearest(position[None])[0]].copy(), velocity
 
 

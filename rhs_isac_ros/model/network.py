@@ -76,18 +76,15 @@ class Admittances(NamedTuple):
         for name in ('y_tt', 'y_st', 'y_ss'):
             array = numbers(name, content[name], complex)
             arrays.append(array[None] if array.ndim == 2 else array)
-        conductance, slope = loads = [
-            numbers(name, content.get(name, np.nan), finite=False) for name in _LOADS]
         n_elements, n_feeds = (*arrays[1].shape, 0, 0)[1:3]
         for name, array, sizes in zip(('y_tt', 'y_st', 'y_ss'), arrays, (
                 (n_feeds, n_feeds), (n_elements, n_feeds), (n_elements, n_elements)), strict=True):
             if array.shape != (n, *sizes) or 0 in array.shape:
                 raise BoardError(f'{name}: shape {array.shape}, expected {(n, *sizes)} for '
                                  f'{n} frequencies, {n_elements} elements and {n_feeds} feeds')
-        for name, load in zip(_LOADS, loads, strict=True):
-            if load.shape not in ((), (n_elements,)):
-                raise BoardError(f'{name}: shape {load.shape}, expected a number or '
-                                 f'[{n_elements}]')
+        conductance, slope = loads = [
+            numbers(name, content.get(name, np.nan), shapes=[(), (n_elements,)], finite=False)
+            for name in _LOADS]
         feeds, between, elements = arrays
         network = cls(frequencies, feeds, between, elements, conductance, slope,
                       digest(*(np.ascontiguousarray(array, array.dtype.newbyteorder('<'))

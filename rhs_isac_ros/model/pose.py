@@ -7,7 +7,7 @@ Several surfaces of one site share the frame of the site. A pose converts betwee
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,8 @@ from rhs_isac_ros.model.arrays import cross, numbers, read_only
 
 # Smallest eigenvalue of a covariance relative to the largest one, up to rounding.
 _MIN_EIGENVALUE = -1e-9
+# Shapes of the fields.
+_SHAPES: tuple[Sequence[tuple[int, ...]], ...] = [(3,)], [(4,)], [(2,), (6, 6)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,14 +49,9 @@ class Pose:
                 raise ValueError(f'quaternion: {parts!r}, expected x, y, z and w')
             object.__setattr__(self, 'quaternion', tuple(parts[name] for name in 'xyzw'))
         position, quaternion, uncertainty = (
-            numbers(field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
-        for name, array, size in (('position_m', position, 3), ('quaternion', quaternion, 4)):
-            if array.shape != (size,):
-                raise ValueError(f'{name}: shape {array.shape}, expected [{size}]')
+            numbers(field.name, getattr(self, field.name), shapes=shapes)
+            for field, shapes in zip(dataclasses.fields(self), _SHAPES, strict=True))
         unit_quaternion(quaternion)
-        if uncertainty.shape not in ((2,), (6, 6)):
-            raise ValueError(f'uncertainty: shape {uncertainty.shape}, expected two standard '
-                             'deviations [m, deg] or a covariance [6, 6]')
         if uncertainty.ndim == 1 and uncertainty.min() < 0:
             raise ValueError(f'uncertainty: {uncertainty.min():g}, expected at least 0')
         if uncertainty.ndim == 2:
@@ -99,9 +96,7 @@ class Pose:
 
         Raises ValueError if the shape is another one, or a number is not finite.
         """
-        states = numbers('positions', states)
-        if states.ndim != 2 or states.shape[1] not in (3, 6):
-            raise ValueError(f'positions: shape {states.shape}, expected [N, 3] or [N, 6]')
+        states = numbers('positions', states, shapes=[('N', 3), ('N', 6)])
         places = self.to_surface(states[:, :3])
         return np.hstack([places, *(
             [self.vectors_to_surface(states[:, 3:])] if states.shape[1] > 3 else [])])

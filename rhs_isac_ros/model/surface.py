@@ -93,7 +93,8 @@ def radiation_matrix(
 @functools.lru_cache(maxsize=64)
 def ports_of(scenario: Scenario, *bands: int) -> Ports:
     """Return the ports of the board in some bands, by default in all."""
-    return Ports(subband_frequencies_hz(scenario)[list(bands) or slice(None)],
+    bands = bands or tuple(range(scenario.n_bands))
+    return Ports(bands, subband_frequencies_hz(scenario)[list(bands)],
                  element_positions(scenario), feed_positions(scenario), scenario.refractive_index)
 
 

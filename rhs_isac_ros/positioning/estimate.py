@@ -13,6 +13,7 @@ from rhs_isac_ros.model.gaussian import symmetric
 from rhs_isac_ros.positioning.mixture import Mixture, with_velocities
 from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.support.fields import finite
+from rhs_isac_ros.support.plugins import PluginError
 
 # Limit far above any received amplitude [sqrt(W)]. The square of a whitened amplitude is still
 # finite in single precision.
@@ -135,6 +136,14 @@ class Estimate:
     #: The `sighting`, or a function that returns it.
     see: Callable[[], Sighting] | Sighting | None = None
     frame: str = SURFACE  #: ``surface`` or ``site``: the frame of the mean and the velocity.
+
+    def __post_init__(self) -> None:
+        """Raise ValueError unless the shapes of mean and covariance agree."""
+        mean = numbers('mean', self.mean, shapes=[(3,), ('N', 3)], finite=False)
+        covariance = numbers(
+            'covariance', self.covariance, shapes=[(*mean.shape, 3)], finite=False)
+        object.__setattr__(self, 'mean', mean)
+        object.__setattr__(self, 'covariance', covariance)
 
     def __repr__(self) -> str:
         """Return position, standard deviations and reason, or how many of N have a position."""
@@ -316,6 +325,8 @@ def estimate_each(
 
 def _possible(estimate: Estimate) -> Estimate:
     """Return an estimate without its position if it has a reason, or if no user can be there."""
+    if not isinstance(estimate, Estimate) or estimate.mean.ndim > 1:
+        raise PluginError(f'{estimate!r}, expected the Estimate of one position')
     # A network or a plug-in may return any position.
     reason = estimate.reason or ((problem := position_problem(estimate.mean))
                                  and f'position: {problem}')
@@ -327,15 +338,10 @@ def _possible(estimate: Estimate) -> Estimate:
 
 def checked_received(codebook: Codebook, received: np.ndarray) -> np.ndarray:
     """Return received signals as complex128 [N, N_B, N_SB F], or raise `SignalError`."""
-    received = numbers('received', received, complex, SignalError, finite=False)
     n_bands, n_subbands, n_frames, _, _ = codebook.shape
     expected = (n_bands, n_subbands * n_frames)
-    if received.ndim not in (2, 3) or received.shape[-2:] != expected:
-        raise SignalError(
-            f'received: shape {received.shape}, expected [N_B, N_SB F] = {expected}, '
-            'or [N, N_B, N_SB F]')
-    if not np.isfinite(received).all():
-        raise SignalError('received: not finite, expected finite signals')
+    received = numbers(
+        'received', received, complex, SignalError, shapes=[expected, ('N', *expected)])
     if received.size and np.abs(received).max() > _MAX_MAGNITUDE:
         raise SignalError(
             f'received: {np.abs(received).max():g}, expected magnitudes up to {_MAX_MAGNITUDE:g}')

@@ -69,17 +69,13 @@ class Mixture(_Arrays):
     def __new__(cls: type[_MixtureT], log_weights: np.ndarray, means: np.ndarray,
                 covariances: np.ndarray) -> _MixtureT:
         """Check the arrays. `_make`, which all methods use, does not."""
-        weights = numbers('log_weights', log_weights, finite=False)
-        centres, spreads = numbers('means', means), numbers('covariances', covariances)
-        if weights.ndim != 1 or not -np.inf < weights.max(initial=-np.inf) < np.inf:
-            raise ValueError(f'log_weights: shape {weights.shape} with a maximum of '
-                             f'{weights.max(initial=-np.inf):g}, expected [C] with a finite one')
+        weights = numbers('log_weights', log_weights, shapes=[('C',)], finite=False)
+        if not -np.inf < weights.max(initial=-np.inf) < np.inf:
+            raise ValueError(f'log_weights: maximum {weights.max(initial=-np.inf):g}, expected a '
+                             'finite one')
         n = len(weights)
-        if centres.ndim != 2 or len(centres) != n or centres.shape[1] not in (3, 6):
-            raise ValueError(f'means: shape {centres.shape}, expected [{n}, 3] or [{n}, 6]')
-        if spreads.shape != (*centres.shape, centres.shape[1]):
-            raise ValueError(f'covariances: shape {spreads.shape}, expected '
-                             f'{(*centres.shape, centres.shape[1])}')
+        centres = numbers('means', means, shapes=[(n, 3), (n, 6)])
+        spreads = numbers('covariances', covariances, shapes=[(*centres.shape, centres.shape[1])])
         if problem := covariance_problem(spreads):
             raise ValueError(f'covariances: {problem}')
         return super().__new__(cls, weights, centres, spreads)
@@ -229,6 +225,7 @@ class Mixture(_Arrays):
     def log_density(self, points: np.ndarray) -> np.ndarray:
         """Evaluate the logarithm of the density at points [..., D], float64 [...]."""
         precision = np.linalg.inv(self.covariances)
+        points = numbers('points', points, shapes=[('...', self.means.shape[1])])
         offsets = points[..., None, :] - self.means
         squares = np.einsum('...cp,cpq,...cq->...c', offsets, precision, offsets)
         return mixture_weights(self.log_peaks - squares / 2)[1]

@@ -8,7 +8,7 @@ import numpy as np
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import frames_s, reference_s
-from rhs_isac_ros.model.mobility import Crowd, Mobility
+from rhs_isac_ros.model.mobility import Crowd, Mobility, state_of
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import Event, Outcome, PeersChanged, Timeout
 from rhs_isac_ros.protocol.role import ANY, REMEMBERED_CYCLES, NewestDict, Row, StateMachine, on
@@ -196,7 +196,7 @@ class User(StateMachine):
         truth = self._truths.get(key)
         if truth is None:
             position, velocity = self._in_site(
-                *self._mobilities[event.user].state(self._time_s(self.now_s)))
+                *state_of(self._mobilities[event.user], self._time_s(self.now_s)))
             truth = m.derive(
                 m.GroundTruth, event, velocity=velocity,
                 position=position + reference_s(self._scenario) * velocity)

@@ -87,7 +87,7 @@ def sources_of(*uses: Any) -> str:
         while isinstance(one, functools.partial):
             one = one.func
         # If a module is loaded again, files are read again only if this code differs.
-        texts += [_definition(member.__code__, set()) for member in (
+        texts += [_definition(inspect.unwrap(member).__code__, set()) for member in (
             vars(one).values() if isinstance(one, type) else [one]) if inspect.isfunction(member)]
         module = sys.modules.get(getattr(one, '__module__', ''))
         named = vars(module).values() if module else ()

@@ -51,8 +51,8 @@ def test_a_configuration_is_copied(contract):
 
 
 @pytest.mark.parametrize(('change', 'expected'), [
-    (lambda values: values[1:], r'^configuration: shape \(\d+,\), expected \(\d+,\)$'),
-    (lambda values: values[None], r'^configuration: shape \(1, \d+\), expected \(\d+,\)$'),
+    (lambda values: values[1:], r'^configuration: shape \(\d+,\), expected \[\d+\]$'),
+    (lambda values: values[None], r'^configuration: shape \(1, \d+\), expected \[\d+\]$'),
     (lambda values: values * 1j, '^configuration: complex numbers'),
     (lambda values: values * np.nan, '^configuration: not finite'),
     (lambda values: values + 1.5 * (np.arange(values.size) == 3),

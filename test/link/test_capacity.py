@@ -133,7 +133,7 @@ def test_an_invalid_covariance_still_gives_a_finite_capacity(table1, covariance)
     (POSITION, np.eye(2), 'covariance'), (POSITION, np.ones(9), 'covariance'),
     (POSITION, np.full((3, 3), np.inf), 'covariance')])
 def test_invalid_moments_are_errors_that_name_the_field(table1, mean, covariance, name):
-    with pytest.raises(ValueError, match=rf'(?s)^{name}: .* expected \[3.* finite'):
+    with pytest.raises(ValueError, match=rf'^{name}: .* expected '):
         posterior_points(table1.scenario, mean, covariance)
 
 

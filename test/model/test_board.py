@@ -148,6 +148,16 @@ def test_states_of_bands_and_elements():
     np.testing.assert_allclose(coefficients[:, 0], expected)
 
 
+@pytest.mark.parametrize('board', [
+    *BOARDS.values(), STATES | {'states': [[[0, 0], [1, 0], [0, 1]], [[1, 0], [0, 0], [2, 0]]]}])
+def test_a_band_alone_has_its_part_of_the_transfer(board):
+    scenario = scenario_with(board)
+    tunings = tunings_of(scenario, np.random.default_rng(0))
+    np.testing.assert_array_equal(
+        scenario.board.transfer(ports_of(scenario, 1), tunings[1:])[0],
+        scenario.board.transfer(ports_of(scenario), tunings)[1])
+
+
 @pytest.mark.parametrize('kind', ['phase', 'resonant', 'states'])
 def test_a_focused_beam_is_in_phase_at_its_point(kind):
     scenario = scenario_with(BOARDS[kind])

@@ -211,8 +211,8 @@ def broken(angles):
     @pytest.mark.parametrize(('name', 'words'), [
         ('absent', r"'absent', expected a plug-in of .*; installed: broken, complex_, minus"),
         ('number', r'antennas:number of antennas: 3.0: TypeError'),
-        ('short', r'antennas:short .* float64 \(1,\), expected real numbers of the shape'),
-        ('complex_', r'antennas:complex_ .* complex128 \(4097,\), expected real'),
+        ('short', r'antennas:short .*: shape \(1,\), expected \[4097\]'),
+        ('complex_', r'antennas:complex_ .*: complex numbers, expected real numbers \[4097\]'),
         ('minus', r'antennas:minus .* gain -0.000\d+ at 1.572 rad, expected 0 to 1e\+06'),
         ('none', r'antennas:none .* gain 0 at all angles below pi/2'),
         ('broken', r"antennas:broken .* KeyError: 'table', expected a function of an array"),
@@ -222,7 +222,7 @@ def broken(angles):
             Scenario(user_gain=name)
 
 
-@pytest.mark.parametrize('gain', [np.nan, np.inf, -1.0, 2e6])
+@pytest.mark.parametrize('gain', [-1.0, 2e6])
 def test_gains_out_of_range_are_errors(gain):
     with pytest.raises(PatternError, match=f'gain {gain:g} at 0.000 rad'.replace('+', r'\+')):
         GainPattern(lambda angles: np.full(angles.shape, gain))

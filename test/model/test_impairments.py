@@ -173,15 +173,15 @@ def test_a_class_that_is_defined_again_replaces_the_previous_one():
 
 
 @pytest.mark.parametrize(('patterns', 'root', 'text'), [
-    (np.ones((1, 2, 3)), np.eye(1), 'patterns: shape (1, 2, 3), expected (1, 2, 32)'),
-    (1j * np.ones((1, 2, 32)), 0.3, 'root: shape (), expected (1, 1)'),
+    (np.ones((1, 2, 3)), np.eye(1), 'patterns: shape (1, 2, 3), expected [q, 2, 32]'),
+    (1j * np.ones((1, 2, 32)), 0.3, 'root: shape (), expected [1, 1]'),
     (np.full((1, 2, 32), np.nan), np.eye(1), 'patterns: not finite')])
 def test_exponents_of_a_wrong_shape_are_errors_that_name_the_impairment(patterns, root, text):
     scenario, rng = Scenario(impairments={_tilted(patterns, root): 0.5}), np.random.default_rng(0)
     for work in (lambda: nuisance_of(scenario), lambda: draw_factors(scenario, 2, rng, rng)):
         with pytest.raises(PluginError) as caught:
             work()
-        assert f'Tilted.linear: {text}' in str(caught.value)
+        assert f'Tilted: {text}' in str(caught.value)
 
 
 def test_multipath_and_noise_do_not_depend_on_impairments(small, uncertain):

@@ -21,7 +21,7 @@ SMALL = Scenario(elements_per_side=4, n_feeds=2, n_subbands=3)
 
 
 def ports_at(*frequencies_hz):
-    return Ports(np.array([frequencies_hz]), VECTORS['elements_m'], VECTORS['feeds_m'], 1.0)
+    return Ports((0,), np.array([frequencies_hz]), VECTORS['elements_m'], VECTORS['feeds_m'], 1.0)
 
 
 def saved(path, **changes):

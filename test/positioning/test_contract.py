@@ -84,7 +84,7 @@ def test_an_empty_batch_gives_empty_estimates(estimator, received):
 
 
 @pytest.mark.parametrize(('signals', 'message'), [
-    (np.zeros((2, 7)), r'^received: shape \(2, 7\), expected \[N_B, N_SB F\] = \(2, 8\)'),
+    (np.zeros((2, 7)), r'^received: shape \(2, 7\), expected \[2, 8\] or \[N, 2, 8\]'),
     (np.zeros(16), r'^received: shape \(16,\), expected '),
     (np.full((2, 8), np.nan), '^received: not finite, expected ')])
 def test_invalid_signals_are_errors(estimator, signals, message):

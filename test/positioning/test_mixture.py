@@ -187,5 +187,5 @@ def test_the_product_of_two_square_roots_is_the_mixture():
 
 
 def test_a_mixture_without_mass_is_refused():
-    with pytest.raises(ValueError, match='log_weights: .* maximum of -inf, expected'):
+    with pytest.raises(ValueError, match='log_weights: maximum -inf, expected'):
         Mixture([-np.inf], [[8.0, 0.0, 0.0]], [np.eye(3)])

@@ -88,9 +88,9 @@ def test_the_error_for_an_invalid_file_names_it(network, tmp_path, damage):
 
 
 @pytest.mark.parametrize(('field', 'value', 'message'), [
-    ('b_in', np.zeros(4), r'b_in: shape \(4,\), expected \(5,\)'),
+    ('b_in', np.zeros(4), r'b_in: shape \(4,\), expected \[5\]'),
     ('w_in', np.zeros(8), 'expected'),
-    ('w_out', np.zeros((5, 2)), r'w_out: shape \(5, 2\), expected \(5, 3\)'),
+    ('w_out', np.zeros((5, 2)), r'w_out: shape \(5, 2\), expected \[5, 3\]'),
     ('center', np.array([0, np.nan, 0]), 'center: not finite'),
     ('inputs', 'phases', "inputs: 'phases', expected one of")])
 def test_inconsistent_arrays_are_errors(network, field, value, message):
