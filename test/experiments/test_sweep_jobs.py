@@ -20,7 +20,7 @@ from rhs_isac_ros.experiments.sweep import (
 from rhs_isac_ros.experiments.sweep_settings import parse_axis, settings_of
 from rhs_isac_ros.link import capacity_report, choose_beam
 from rhs_isac_ros.model import PathChannel, Scenario
-from rhs_isac_ros.model.elementwise import Elementwise
+from rhs_isac_ros.model.elementwise import Paper
 from rhs_isac_ros.positioning import Estimate, make_estimator
 from rhs_isac_ros.system import System
 
@@ -125,18 +125,12 @@ def test_the_power_of_a_codebook_can_be_changed(codebook):
 
 def test_objects_of_a_scenario_reach_other_processes(tmp_path):
     """A board, a gain pattern and a channel that have no names."""
-    class Squared(Elementwise):
-        kind = 'squared'
-
-        def coefficients(self, ports, tunings):
-            return tunings[:, None]**2
-
-        def slopes(self, ports, tunings):
-            return 2 * tunings[:, None]
+    class Own(Paper):
+        kind = 'own'
     users = WORLD.sample_positions(50, np.random.default_rng(0))
     paths = PathChannel(users, 1e-3 / np.linalg.norm(users, axis=1)[:, None] + 0j,
                         users[:, None], np.zeros((50, 1), int), 2.75e9)
-    base = Scenario(**SMALL, board=Squared, channel=paths,
+    base = Scenario(**SMALL, board=Own, channel=paths,
                     element_gain=lambda angles: 2 * np.maximum(np.cos(angles), 0))
     sweep = Sweep(base, settings_of(base, [parse_axis('n_frames=1,2')], 'random', 'bayes'),
                   ['crlb', 'rmse'], n_positions=4)
