@@ -22,7 +22,9 @@ With `--walking`, each ingredient meets the users of config/lab_walk.yaml instea
 1 m/s while the surface steps its patterns. Cycles of a track are then 0.6 s apart, carriers are
 off by 1 Hz, and the region is that of the lab.
 
-With `--site`, several surfaces have another arrangement than the right angle of `site`.
+With `--site`, several surfaces have another arrangement than the right angle of `site`. With
+`--sites`, the table contains all arrangements instead, with the bands of Table I and of the band
+plan: half of the users are outside of the region, as the scenarios declare.
 """
 
 import argparse
@@ -56,11 +58,14 @@ N_CYCLES, SPEED_MPS = 20, 1.0
 # tilts [deg] of the surfaces of each site.
 SITES = {
     'right_angle': ((0.0, 0.0, 0.0), (90.0, 0.0, 0.0)),
+    'diagonal': ((-45.0, 0.0, 0.0), (45.0, 0.0, 0.0)),
     'sixty': ((0.0, 0.0, 0.0), (60.0, 0.0, 0.0)),
+    'sixty_both_sides': ((0.0, 0.0, 0.0), (60.0, 0.0, 0.0), (-60.0, 0.0, 0.0)),
     'facing': ((0.0, 2.0, 0.0), (180.0, -2.0, 0.0)),
     'tilted': ((0.0, 0.0, 20.0), (90.0, 0.0, -15.0)),
     'three': ((0.0, 0.0, 0.0), (100.0, 0.0, 0.0), (220.0, 1.0, 0.0)),
 }
+PLANS = ('table1', 'bandplan')  # of `--sites`
 SHELL_M = (0.5, 5.0)
 # A variance above this counts as a dimension [m^2].
 LEAST_M2 = 1e-8
@@ -417,7 +422,10 @@ def main() -> None:
     add('--csv', type=output_file, help='CSV file for the table of the documentation')
     add('--walking', action='store_true', help='each ingredient with users who walk in the lab')
     add('--site', choices=SITES, default=Setting.site, help='arrangement of several surfaces')
+    add('--sites', action='store_true', help='users outside of all arrangements of surfaces')
     options = parser.parse_args()
+    if options.sites and (options.only or options.csv or options.walking):
+        parser.error('--sites: expected without --only, --csv and --walking')
     print(f'{options.positions} positions, seed {options.seed}\n')
     results = measure(options)
     if options.csv:
@@ -430,15 +438,21 @@ Cells = dict[str, dict[str, dict[str, Any]]]
 
 
 def measure(options: argparse.Namespace) -> Cells:
-    """Measure the requested cells; each is stored under both orders of its ingredients."""
-    chosen = set(pairs(options.only, options.walking))
-    cells = {(one, other): ' + '.join(dict.fromkeys((one, other)))
-             for one, other in pairs(()) if (one, other) in chosen}
-    found = frame.measured(options, 'combinations', measured_cell, {
-        name: {'one': one, 'other': other, 'n': options.positions, 'seed': options.seed,
-               'walking': options.walking, 'site': options.site}
-        for (one, other), name in cells.items()})
-    table = frame.Table(['ingredients'], {
+    """Measure the requested cells; pairs are stored under both orders of their ingredients."""
+    common = {'n': options.positions, 'seed': options.seed}
+    if options.sites:
+        function: Callable[..., dict[str, Any]] = measured_site
+        cells = {(plan, site): f'{plan}, {site}' for plan in PLANS for site in SITES}
+        cases = {name: common | {'plan': plan, 'site': site}
+                 for (plan, site), name in cells.items()}
+    else:
+        function, chosen = measured_cell, set(pairs(options.only, options.walking))
+        cells = {(one, other): ' + '.join(dict.fromkeys((one, other)))
+                 for one, other in pairs(()) if (one, other) in chosen}
+        cases = {name: common | {'one': one, 'other': other, 'walking': options.walking,
+                                 'site': options.site} for (one, other), name in cells.items()}
+    found = frame.measured(options, 'combinations', function, cases)
+    table = frame.Table(['surfaces' if options.sites else 'ingredients'], {
         'fix [%]': ('fix', 1), 'wrong fix [%]': ('wrong_fix', 1),
         'in the 95 % region [%]': ('in_region', 1), 'NEES': ('nees', 2),
         'dimensions': ('dimensions', 1), 'MSE ratio': ('mse_ratio', 2),
@@ -447,7 +461,9 @@ def measure(options: argparse.Namespace) -> Cells:
     results: Cells = {}
     for (one, other), name in cells.items():
         row = found[name]
-        results.setdefault(one, {})[other] = results.setdefault(other, {})[one] = row
+        results.setdefault(one, {})[other] = row
+        if not options.sites:
+            results.setdefault(other, {})[one] = row
         table.row(name, **row | {'fix': row.get('refused') or row['fix']})
     frame.write_results(options.json, results)
     return results
@@ -460,6 +476,14 @@ def measured_cell(one: str, other: str, n: int, seed: int, walking: bool, site: 
     number = [*pairs(())].index((one, other))
     rng = streams.generator(seed, streams.HELD_OUT, number)
     return cell(one, other, n, rng, walking, site) | {'positions': n, 'seed': seed}
+
+
+def measured_site(plan: str, site: str, n: int, seed: int) -> dict[str, Any]:
+    """Run a job: return the figures of a site with as many users outside as it declares."""
+    share = frame.system(plan)[0].outside_probability
+    found = run_cell(Setting(plan=plan, site=site, has_site=True, outside=share), n,
+                     streams.generator(seed, streams.HELD_OUT)).figures()
+    return found | {'positions': n, 'seed': seed}
 
 
 def cell(one: str, other: str, n: int, rng: np.random.Generator, walking: bool = False,

@@ -77,8 +77,15 @@ def test_users_outside_count_only_for_wrong_fixes():
     assert found['mse_m2'][0] < 1
 
 
-def test_a_site_has_no_positions_of_users_outside():
-    found = cell('site', 'outside', 8, np.random.default_rng(3))
+def test_sites_have_no_positions_of_users_outside(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(combinations, 'SITES', {'sixty': combinations.SITES['sixty']})
+    monkeypatch.setattr(combinations, 'PLANS', ('bandplan',))
+    options = argparse.Namespace(
+        positions=8, seed=3, sites=True, json=tmp_path / 'sites.json', jobs=1, dask=None,
+        walking=False)
+    measure(options)
+    found = json.loads(options.json.read_text())['bandplan']['sixty']
     assert (found['fix'][0], found['wrong_fix'][0]) == (100, 0)
 
 
@@ -86,7 +93,7 @@ def test_finished_cells_are_kept_until_all_are_measured(monkeypatch, tmp_path, c
     monkeypatch.chdir(tmp_path)
     options = argparse.Namespace(
         positions=5, seed=1, only=['site'], json=tmp_path / 'cells.json', jobs=1, dask=None,
-        walking=False, site='three')
+        walking=False, site='three', sites=False)
     measured = []
 
     def counted(one, other, n, rng, walking, site):
