@@ -95,10 +95,10 @@ def sobol(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
     """Draw scrambled Sobol points in the region of interest, float64 [n, 3] [m].
 
     They are more evenly spread than independent points, and most evenly if `n` is a power of two.
-    SciPy scrambles them with a child of the seed of the generator, not with its next numbers: a
+    They are scrambled with a child of the seed of the generator, not with its next numbers: a
     second call gives other points, but numbers drawn in between make no difference.
     """
-    points = streams.sobol(3, rng).random_base2(max(n - 1, 0).bit_length())[:n]
+    points = streams.sobol(3, max(n - 1, 0).bit_length(), rng)[:n]
     low, high = scenario.roi_bounds_m
     return low + (high - low) * points
 

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtri, stdtrit
 
 _RESAMPLES = 2000
 _INTERVAL = (2.5, 97.5)
@@ -78,6 +77,7 @@ def share_percent(count: int, total: int) -> tuple[float, float, float]:
     """Return `count` relative to `total` [%], and the ends of Wilson's 95 % interval [%]."""
     if total < 1:
         raise ValueError(f'total: {total}, expected at least 1')
+    from scipy.special import ndtri
     z2 = float(ndtri(0.975))**2
     centre = (count + z2 / 2) / (total + z2)
     half = np.sqrt(z2 * (count * (total - count) / total + z2 / 4)) / (total + z2)
@@ -131,6 +131,7 @@ def _spread(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
     uncertain = sum(np.nanvar(part[1:])**2 / (n - 1) for part, n in parts if n > 1)
     widening = 1.0
     if uncertain > 0 and np.isfinite(total):
+        from scipy.special import ndtri, stdtrit
         widening = float(stdtrit(max(total / uncertain, 1.0), 0.975) / ndtri(0.975))
     return (float(values[0]), float(values[0] + widening * (low - values[0])),
             float(values[0] + widening * (high - values[0])))

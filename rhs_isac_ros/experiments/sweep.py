@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.bounds import global_bound
@@ -112,6 +111,7 @@ def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, An
         return {'crlb_m2': system.crlb(positions).tolist()}
     located = _estimator(estimator, json.dumps(scenario), json.dumps(codebook)).estimate(received)
     fix = located.fix
+    from scipy.special import chdtri
     # Without a fix, only the region is known.
     mean = np.where(fix[:, None], located.mean, world.roi_center_m)
     covariance = np.where(

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import gammaln, xlog1py, xlogy
 
 from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.arrays import adjoint, mixture_weights, multiply_rows
@@ -166,8 +165,9 @@ def _failure_counts(n_elements: int, share: float) -> tuple[np.ndarray, np.ndarr
     """Return numbers of failures divided by the mean, and the logs of their probabilities."""
     if share == 0:
         return np.zeros(1), np.zeros(1)
+    # The distribution of `scipy.stats`, whose import takes a second. Most nodes need neither.
+    from scipy.special import gammaln, xlog1py, xlogy
     counts = np.arange(n_elements + 1)
-    # The distribution of `scipy.stats`, whose import takes a second.
     probability = np.exp(
         gammaln(n_elements + 1) - gammaln(counts + 1) - gammaln(n_elements - counts + 1)
         + xlogy(counts, share) + xlog1py(n_elements - counts, -share))

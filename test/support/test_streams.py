@@ -2,6 +2,7 @@
 
 import itertools
 
+import numpy as np
 import pytest
 from scipy.stats import qmc
 
@@ -32,7 +33,12 @@ def test_equal_keys_give_equal_sequences_and_others_different_ones():
         assert not set(a) & set(b)
 
 
-@pytest.mark.parametrize('n_dimensions', [3, 6])
-def test_unit_points_are_a_sobol_sequence_of_scipy(n_dimensions):
+@pytest.mark.parametrize('n_dimensions', [1, 3, 6])
+def test_points_are_a_sobol_sequence_of_scipy(n_dimensions):
     expected = qmc.Sobol(n_dimensions, scramble=True, seed=0).random(1024)
     assert streams.unit_points(n_dimensions).tolist() == expected.tolist()
+    generators = [np.random.default_rng(5) for _ in range(2)]
+    for log2_n in (0, 1, 6, 11):
+        ours, theirs = generators
+        expected = qmc.Sobol(n_dimensions, scramble=True, seed=theirs).random_base2(log2_n)
+        assert streams.sobol(n_dimensions, log2_n, ours).tolist() == expected.tolist()
