@@ -7,6 +7,7 @@ the Common Data Representation (CDR), version 1, little endian.
 
 import dataclasses
 import enum
+import itertools
 import math
 import struct
 import sys
@@ -147,7 +148,7 @@ class Codec:
     """
 
     def __init__(self, kind: type[Any], types: dict[str, str]) -> None:
-        self._kind = kind
+        self._kind, self._types = kind, types
         own = {field.name: field.type for field in dataclasses.fields(kind)}
         self._keeps_stamp = 'stamp_ns' in own
         enums = {name: one for name, one in own.items()
@@ -266,23 +267,22 @@ class Codec:
         are no message unchanged. The added fields have the defaults of the dataclass; if one of
         them has none, there is no function.
         """
-        defaults = {field.name: field for field in dataclasses.fields(self._kind)}
-        added: list[tuple[_Field, Sequence[Any]]] = []
-        for one in self._fields[max(n_fields, 1) - 1:]:
-            value = _default(defaults[one.name])
-            if value is dataclasses.MISSING:
+        earlier = Codec(self._kind, dict(itertools.islice(self._types.items(), n_fields)))
+        defaults = {field.name: _default(field) for field in dataclasses.fields(self._kind)}
+        added: list[Any] = []
+        for name, _, _, encode, _ in self._fields[len(earlier._fields):]:
+            if defaults[name] is dataclasses.MISSING:
                 return None
-            added.append((one, [value] if one.encode is None else one.encode(value)))
+            added += [defaults[name]] if encode is None else encode(defaults[name])
 
         def extend(data: bytes) -> bytes:
+            if not data.startswith(HEADER[:2]):
+                return data
             try:
-                # A number or a size, and padding, of each item are at most 16 bytes.
-                items = self._items(data + bytes(16 * sum(len(values) for _, values in added)))
+                items = earlier._items(data)
             except (struct.error, ValueError):
                 return data
-            for one, values in added:
-                items[one.first:one.last] = values
-            return self._packed(items)
+            return self._packed([*items, *added])
         return extend
 
     def _items(self, data: bytes) -> list[Any]:

@@ -220,7 +220,7 @@ def read(
 
     The messages are sorted by time; copies of a recording may have them in another order. The
     known types are those of `recorded_topics`. `names`, if given, selects topics by full name.
-    Fields that the installed type has after those of the recorded one are 0 or empty. Raises
+    Fields that the installed type has after those of the recorded one have their defaults. Raises
     RecordingError if the file cannot be read, or a type differs otherwise.
     """
     kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}

@@ -20,6 +20,7 @@ from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import MessageError
+from rhs_isac_ros.protocol.presences import Presence
 from rhs_isac_ros.ros import cdr, convert, topics
 from rhs_isac_ros.ros.convert import CodebookMessage
 from rhs_isac_ros.ros.topics import Frame
@@ -103,6 +104,23 @@ def test_rclpy_and_the_bytes_agree(kind):
             sent, value = getattr(expected, name, None), getattr(received, name)
             if isinstance(sent, (int, float, str)):
                 assert sent == value or sent != sent, name
+
+
+def test_a_message_gets_the_fields_that_it_lacks_only_if_they_have_defaults():
+    fields = list(ros.Presence.get_fields_and_field_types())
+    presence = Presence(sender=3, scenario_id='sc', role='bs', node='/bs', scenario='{}',
+                        stamp_ns=7, use_sim_time=True, library_id='lib')
+    whole = convert.to_bytes(presence, 7)
+    n = fields.index('use_sim_time')
+    extend = convert.extension(ros.Presence, n)
+    # A flag, and the size and the content of a text follow.
+    lacking = whole[:-1 - 4 - len('lib\0')]
+    assert convert.from_bytes(Presence, extend(lacking)) == dataclasses.replace(
+        presence, use_sim_time=False, library_id='')
+    for bad in (b'', lacking[:-1], b'\0\0' + lacking[2:]):
+        assert extend(bad) == bad
+    assert convert.extension(ros.Presence, n - 1) is None
+    assert convert.extension(Point, 3) is None
 
 
 def test_another_encoding_is_named():
