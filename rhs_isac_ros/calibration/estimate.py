@@ -19,7 +19,7 @@ from rhs_isac_ros.calibration.mixture import (
     without_data,
 )
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Beamforming, Scenario, SurfaceEstimate
-from rhs_isac_ros.model.arrays import blocks, check_arrays, checked_positions, numbers
+from rhs_isac_ros.model.arrays import blocks, checked_positions, numbers
 from rhs_isac_ros.model.elements import direct_design, element_radiation, scattered_errors
 from rhs_isac_ros.model.gaussian import covariance_root, quadratic_form, step_to_maximum
 from rhs_isac_ros.model.impairments import UNIFORM_STD_RAD, Nuisance, nuisance_of
@@ -62,9 +62,9 @@ class Pilots:
     def __post_init__(self) -> None:
         """Check the arrays."""
         object.__setattr__(self, 'positions', checked_positions(self.positions))
-        object.__setattr__(self, 'received', numbers('received', self.received, complex))
         n_bands, n_subbands, n_frames, _ = self.beams.digital.shape
-        check_arrays(self, {'received': (len(self.positions), n_bands, n_subbands * n_frames)})
+        object.__setattr__(self, 'received', numbers('received', self.received, complex, shapes=[
+            (len(self.positions), n_bands, n_subbands * n_frames)]))
 
 
 def prior_of(scenario: Scenario) -> SurfacePrior:

@@ -26,7 +26,6 @@ import numpy as np
 from rhs_isac_ros.model.arrays import (
     adjoint,
     blocks,
-    check_arrays,
     digest,
     gauss_legendre,
     numbers,
@@ -181,16 +180,15 @@ class SurfaceEstimate(SurfaceModel):
 
     def __post_init__(self) -> None:
         """Copy and check the arrays, and make them read-only."""
-        for field in dataclasses.fields(self):
-            kind = float if field.name == 'failed_probability' else complex
-            array = numbers(field.name, getattr(self, field.name), kind)
-            object.__setattr__(self, field.name, read_only(array.copy('K')))
-        n_elements, n_bands, probability = (
-            self.gains.size, self.band_gains.size, self.failed_probability)
-        check_arrays(self, {
-            'gains': (n_elements,), 'offsets': (n_elements,), 'band_gains': (n_bands,),
-            'factor': (2 * n_elements + n_bands, (*self.factor.shape, 0, 0)[1]),
-            'failed_probability': (n_elements,)})
+        n_elements, n_bands = np.size(self.gains), np.size(self.band_gains)
+        for name, kind, shape in (
+                ('gains', complex, (n_elements,)), ('offsets', complex, (n_elements,)),
+                ('band_gains', complex, (n_bands,)),
+                ('factor', complex, (2 * n_elements + n_bands, 'R')),
+                ('failed_probability', float, (n_elements,))):
+            array = numbers(name, getattr(self, name), kind, shapes=[shape])
+            object.__setattr__(self, name, read_only(array.copy('K')))
+        probability = self.failed_probability
         if n_elements and not (0 <= probability.min() and probability.max() <= 1):
             raise ValueError(f'failed_probability: {probability.min():g} to '
                              f'{probability.max():g}, expected 0 to 1')

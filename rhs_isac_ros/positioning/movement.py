@@ -167,8 +167,8 @@ class _Others:
             system.codebook, system.surface))
         self._refinement = refinement_of(self._likelihood)
         self._turns = turns
-        numbers = np.arange(-turns, turns + 1)
-        numbers = numbers[(numbers != 0) | (turns == 0), None, None]
+        numbers = np.array([
+            n for n in range(-turns, turns + 1) if n or not turns])[:, None, None]
         frequencies_hz, times_s = np.array(scenario.center_frequencies_hz), frame_times_s(scenario)
         self._further_mps = numbers * SPEED_OF_LIGHT_MPS / (
             frequencies_hz.mean() * scenario.frame_duration_s)

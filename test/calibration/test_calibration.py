@@ -78,7 +78,7 @@ def test_a_file_for_another_scenario_is_refused(file, scenario):
 
 @pytest.mark.parametrize(('changes', 'error'), [
     ({'gains': np.ones(3)}, r'gains.*|offsets: shape \(25,\), expected \[3\]'),
-    ({'factor': np.ones((4, 2))}, r'factor: shape \(4, 2\), expected \[52, 2\]'),
+    ({'factor': np.ones((4, 2))}, r'factor: shape \(4, 2\), expected \[52, R\]'),
     ({'factor': np.ones(4)}, 'factor: shape'),
     ({'offsets': np.full(25, np.nan)}, 'offsets: not finite'),
     ({'failed_probability': np.full(25, 1.5)}, 'failed_probability: 1.5 to 1.5, expected 0 to 1'),
