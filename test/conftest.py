@@ -18,7 +18,6 @@ import pytest
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.support import plugins
 
 # Fixtures that several folders share. Processes and nodes need ROS; the pure layers do not.
 pytest_plugins = ['in_memory_network']
@@ -316,7 +315,7 @@ def table1_estimator(shipped):
 @pytest.fixture(autouse=True, scope='session')
 def without_installed_plugins():
     """Hide plug-ins that are installed in the environment, which are not part of the tests."""
-    find, home = plugins.metadata.entry_points, Path(sysconfig.get_path('purelib'))
+    find, home = metadata.entry_points, Path(sysconfig.get_path('purelib'))
 
     def entry_points(**chosen):
         found = find(**chosen)
@@ -325,7 +324,7 @@ def without_installed_plugins():
         return type(found)(
             point for point in found if Path(point.dist.locate_file('')) != home)
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(plugins.metadata, 'entry_points', entry_points)
+        monkeypatch.setattr(metadata, 'entry_points', entry_points)
         yield
 
 

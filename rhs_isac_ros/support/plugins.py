@@ -6,7 +6,7 @@ in place of a name also has such a name, under which this process finds it again
 
 import sys
 import weakref
-from importlib import import_module, metadata
+from importlib import import_module
 from operator import attrgetter
 from typing import Any
 
@@ -24,9 +24,15 @@ class PluginError(ValueError):
     """A plug-in is not installed, cannot be loaded, or does not have the required interface."""
 
 
+def _entry_points(**chosen: str) -> Any:
+    # Few processes have plug-ins, and each would import this for a twentieth of a second.
+    from importlib import metadata
+    return metadata.entry_points(**chosen)
+
+
 def names(group: str) -> tuple[str, ...]:
     """Return the sorted names of the plug-ins installed in a group of entry points."""
-    return tuple(sorted({point.name for point in metadata.entry_points(group=group)}))
+    return tuple(sorted({point.name for point in _entry_points(group=group)}))
 
 
 def describe(group: str, name: Any) -> str:
@@ -35,7 +41,7 @@ def describe(group: str, name: Any) -> str:
         return name
     return ' and '.join(sorted(
         f'entry point {group}: {name} = {point.value} of {point.dist.name if point.dist else "?"}'
-        for point in metadata.entry_points(group=group, name=name)))
+        for point in _entry_points(group=group, name=name)))
 
 
 #: Objects that callers have given in place of names, by ``module:name``; loaded ones by name.
@@ -77,7 +83,7 @@ def load(group: str, plugin: Any, base: type | None = None) -> Any:
     module, is_named, attribute = name.partition(':')
     if base and is_named and module.partition('.')[0] in sys.stdlib_module_names:
         raise PluginError(f'{name}: expected a module outside of the standard library')
-    points = () if is_named else tuple(metadata.entry_points(group=group, name=name))
+    points = () if is_named else tuple(_entry_points(group=group, name=name))
     if not (points or is_named):
         installed = ', '.join(names(group)) or 'none'
         raise PluginError(f'{name!r}, expected a plug-in of {group}; installed: {installed}')
