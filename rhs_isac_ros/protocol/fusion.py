@@ -239,12 +239,10 @@ class Fusion(Role):
             self._no_fix(fix, str(fused.reason))
         else:
             self._publish(fix, sightings, fused, self._stopwatch() - begin)
-        # Surfaces that disagree about users whom each of them sees inside have wrong poses.
-        if self._test and all(
+        # Surfaces that disagree about users whom each and all of them see inside have wrong poses.
+        if self._test and fused.fix and all(
                 one.outside_probability <= LIMIT for one in fix.posteriors.values()):
-            place = fused.mean if fused.fix else next(iter(
-                sightings.values())).mixture.position().moments()[0]
-            self._test.add(agreements, place)
+            self._test.add(agreements, fused.mean)
             self._examine(self._test.suspects())
 
     def _trusted(self, name: str, sighting: Sighting) -> Sighting:

@@ -358,10 +358,18 @@ def test_a_wrong_pose_is_named_and_counts_less_until_it_is_right_again(
     assert 'warning.poses' not in fusion.status()
     fusion.handle(answer('front', 90), 90.0)
     before, _ = sent(fusion.handle(answer('side', 90), 90.0))
-    assert run(fusion, answer, 6.0, 100) == ['surfaces front, side disagree: a pose is wrong']
+    assert run(fusion, answer, 3.0, 100) == ['surfaces front, side disagree: a pose is wrong']
     assert fusion.status()['warning.poses'] == 'surfaces front, side disagree: a pose is wrong'
     fusion.handle(answer('front', 190), 190.0)
     suspect, _ = sent(fusion.handle(answer('side', 190), 190.0))
     assert np.trace(suspect.covariance_m2) > np.trace(before.covariance_m2)
     assert run(fusion, answer, 0.0, 200, 2 * WINDOW) == ['the surfaces agree again']
     assert 'warning.poses' not in fusion.status()
+
+
+def test_users_whom_all_surfaces_together_see_outside_are_no_evidence_of_a_wrong_pose(
+        fusion, answer, agreements):
+    fusion.handle(agreements, 0.0)
+    # The side surface sees them 2 m beyond the region.
+    assert run(fusion, answer, 6.0, 1) == []
+    assert fusion.counters['no_fix'] > 0.9 * WINDOW
