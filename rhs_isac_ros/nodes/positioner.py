@@ -14,6 +14,7 @@ from rhs_isac_ros.model import simulate_received
 from rhs_isac_ros.model.geometry import undeclared_movement
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning.alternatives import unrecognised_outside
+from rhs_isac_ros.positioning.site import LEFT_OUT
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
@@ -77,7 +78,8 @@ class PositionerNode(LocatingNode[Positioner]):
         surface = calibrated_surface(settings, self.surface)
         options = kind.accepted(
             table_folder=self.table_folder, model_file=settings.model_file,
-            reject_outside=settings.reject_outside, progress=self._on_progress)
+            reject_outside=settings.reject_outside, progress=self._on_progress,
+            **({'left_out': LEFT_OUT} if self.surface.site else {}))
         estimator = kind.create(System(self.scenario, codebook, surface), **{
             **options, **kind.parse(settings.estimator_options)})
         # The first estimate takes longer than later ones; no user should have to wait for it.

@@ -64,7 +64,7 @@ from rhs_isac_ros.positioning.segments import Segments, concatenate, select
 from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.positioning.templates import N_NORMAL, standard_normal, tabulate
-from rhs_isac_ros.support.fields import finite
+from rhs_isac_ros.support.fields import Field, finite
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 from rhs_isac_ros.system import System
 
@@ -111,6 +111,9 @@ class SearchEstimator(abc.ABC):
     lazy
         Whether the table of the region is computed only when it is first needed. With a mixture as
         prior, it rarely is.
+    left_out
+        Largest share of the posterior of modes that are left out, from 1e-12 to
+        `MISS_PROBABILITY`; less if other surfaces may favour them.
     """
 
     averages = True  # Whether positions are averages over the posterior.
@@ -119,11 +122,14 @@ class SearchEstimator(abc.ABC):
     def __init__(
             self, system: System, table_folder: str | Path | None = None, *,
             reject_outside: bool = False, progress: Callable[[float], None] | None = None,
-            lazy: bool = False) -> None:
+            lazy: bool = False, left_out: float = MISS_PROBABILITY) -> None:
         self.system, self.scenario = system, system.scenario
         scenario = system.scenario
         self._likelihood = likelihood = Likelihood(system)
         self._rejects_outside = reject_outside and bool(scenario.outside_probability)
+        # Margin of the search beyond the usual one.
+        self._margin = float(np.log(MISS_PROBABILITY / Field(
+            float, low=1e-12, high=MISS_PROBABILITY).checked('left_out', left_out)))
         self._load = functools.partial(
             load_table, system, table_folder, progress, model=likelihood.model)
         prior, n_measurements = likelihood.nuisance, likelihood.model.n_whitened
@@ -361,7 +367,7 @@ class SearchEstimator(abc.ABC):
               whitened: np.ndarray, draws: bool) -> list['_Searched']:
         """Find the posterior of each shot."""
         # Margin of modes in each cell, beyond the usual one.
-        margin = self._refinement.margin + PRIOR_MARGIN * scope.favoured
+        margin = self._margin + self._refinement.margin + PRIOR_MARGIN * scope.favoured
         starts, drawn = scope.table.search(
             whitened, self._likelihood.nuisance, GRID_MARGIN + scope.alignment.margin + margin,
             scope.drawn.fit if scope.drawn and draws else None)

@@ -21,6 +21,9 @@ from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import mapping_of, read_yaml
 from rhs_isac_ros.system import System, SystemFiles
 
+# Share of the posterior of a surface that its modes may leave out. The only modes on which all
+# surfaces agree may be unlikely for each of them.
+LEFT_OUT = 5e-5
 # Number of decimals of regions [m], and tolerance of their comparisons [m].
 _DECIMALS, _TOLERANCE_M = 6, 2e-6
 
@@ -123,7 +126,8 @@ class SiteEstimator:
 
     def __init__(self, site: Site, table_folder: str | Path | None = None) -> None:
         self._site = site
-        self._estimators = {name: BayesEstimator(one, table_folder, reject_outside=True)
+        self._estimators = {name: BayesEstimator(
+            one, table_folder, reject_outside=True, left_out=LEFT_OUT)
                             for name, one in site.surfaces.items()}
 
     def sightings(self, received: Mapping[str, np.ndarray]) -> dict[str, Sighting]:

@@ -305,6 +305,24 @@ def test_posteriors_of_several_shots_are_those_of_each(table1_estimator, phases)
     assert found[3].mixture is None
 
 
+def test_fewer_modes_are_left_out_for_other_surfaces(random_beams):
+    scenario = Scenario(
+        center_frequencies_hz=(2.5e9, 2.7e9), n_subbands=4, n_frames=2, elements_per_side=6,
+        carrier_offset_std_hz=200.0)
+    codebook, rng = random_beams(scenario, np.random.default_rng(0)), np.random.default_rng(1)
+    received = simulate_received(scenario, codebook, scenario.sample_positions(20, rng), rng)
+    usual, more = (make_estimator('bayes', scenario, codebook, **options).posterior(received)
+                   for options in ({}, {'left_out': 1e-6}))
+    # Most estimates differ by less than a tenth of their standard deviation.
+    offsets = more.mean - usual.mean
+    assert np.mean(squared_normalised(offsets, usual.covariance) < 0.1**2) >= 0.8
+    few, many = (np.array([len(one[n].sighting.likelihood.means) for n in range(20)])
+                 for one in (usual, more))
+    assert (many >= few).all() and many.sum() > 1.3 * few.sum()
+    with pytest.raises(ValueError, match='left_out: 0.1, expected'):
+        make_estimator('bayes', scenario, codebook, left_out=0.1)
+
+
 def test_a_region_far_shorter_than_the_wavelength_has_a_mode_for_all_signals(random_beams):
     """The likelihood has no maximum along the range in the few cells near the prior of a track."""
     scenario = Scenario(
