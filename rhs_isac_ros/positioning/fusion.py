@@ -44,6 +44,7 @@ from rhs_isac_ros.positioning.products import (
 from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.positioning.sheets import move_inside
 from rhs_isac_ros.positioning.templates import standard_normal
+from rhs_isac_ros.support.recent import Recent
 from rhs_isac_ros.support.threads import one_blas_thread
 
 
@@ -67,6 +68,8 @@ class _Limits(NamedTuple):
     margin: float = 5.0
     parts: int = 32
     halvings: int = 8
+    # Number of results of each kind that a `Fuser` keeps.
+    kept: int = 256
     # Largest share of a variance that is the same in all phases.
     constant: float = 0.98
     # Logarithm of a likelihood of 0.
@@ -107,9 +110,9 @@ class Fuser:
         bounds_m = checked_bounds(bounds_m)
         self._bounds_m, self._outside_probability = bounds_m, outside_probability
         self._velocity_variance = velocity_variance(user_speed_std_mps, bounds_m)
-        self._factor = functools.cache(lambda one: _Factor.of(one, bounds_m))
-        self._product = functools.cache(self._multiply)
-        self._fused = functools.cache(self._locate)
+        self._factor = Recent(functools.partial(_Factor.of, bounds_m=bounds_m), _LIMITS.kept)
+        self._product = Recent(self._multiply, _LIMITS.kept)
+        self._fused = Recent(self._locate, _LIMITS.kept)
 
     @one_blas_thread
     def fuse(self, sightings: Sequence[Sighting]) -> Estimate:

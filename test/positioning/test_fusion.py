@@ -1,6 +1,7 @@
 """Positions from the signals of several surfaces."""
 
 import dataclasses
+import pickle
 
 import numpy as np
 import pytest
@@ -337,6 +338,8 @@ def test_products_of_the_same_sightings_are_computed_once():
         assert np.array_equal(found.mixture.means, expected.mixture.means)
     # The surface is the same, but may be elsewhere with a higher probability.
     assert fuser.fuse([one, dataclasses.replace(two, missing=0.5)]) is not pair
+    copied = pickle.loads(pickle.dumps(fuser))
+    assert copied.fuse([one, two]).log_agreement == pair.log_agreement
 
 
 def outside_probability(*log_ratios, poses=(FRONT, SIDE), place=PLACE, **fields):
