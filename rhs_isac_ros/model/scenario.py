@@ -283,7 +283,9 @@ class Scenario(Extensions, Table1):
     def __post_init__(self) -> None:
         """Convert every field to its declared type and check it."""
         for field in dataclasses.fields(self):
-            object.__setattr__(self, field.name, checked(field, getattr(self, field.name)))
+            # Defaults are valid; most fields have them.
+            if (value := getattr(self, field.name)) is not field.default:
+                object.__setattr__(self, field.name, checked(field, value))
         if self.feed_positions_m is not None and len(self.feed_positions_m) != self.n_feeds:
             raise ScenarioError(f'feed_positions_m: {len(self.feed_positions_m)} positions, '
                                 f'expected n_feeds = {self.n_feeds}')
@@ -315,8 +317,7 @@ class Scenario(Extensions, Table1):
             raise ScenarioError(
                 'amplitude_levels: 1, expected 0 for continuous amplitudes, or at least 2')
         for name in ('board', *_FILES):
-            part = getattr(self, name)
-            if part is not None and (misfit := part.misfit(self)):
+            if (part := getattr(self, name)) is not None and (misfit := part.misfit(self)):
                 raise ScenarioError(f'{name}: {misfit}')
 
     def _check_elements(self) -> None:
@@ -354,9 +355,8 @@ class Scenario(Extensions, Table1):
             with translated((TypeError, ValueError), ScenarioError, f'{path}: grid'):
                 content = nr_grid(**content.pop('grid')) | content
         known = [field.name for field in dataclasses.fields(cls)]
-        for key in content:
-            if key not in known:
-                raise ScenarioError(f'{path}: {key}: unknown field, expected one of {known}')
+        if unknown := [key for key in content if key not in known]:
+            raise ScenarioError(f'{path}: {unknown[0]}: unknown field, expected one of {known}')
         content = _with_paths(content, lambda file: str(Path(path).parent / file))
         with translated(ScenarioError, ScenarioError, path):
             return cls(**content)
