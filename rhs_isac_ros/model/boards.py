@@ -26,11 +26,12 @@ def board_of(value: Any) -> Board:
         value = value()
     if isinstance(value, Board):
         name = value.plain if isinstance(value.plain, str) else value.plain['kind']
-        if name not in plugins.LOADED and BUILT_IN.get(name) is not type(value):
+        key = plugins.key_of(plugins.BOARDS, name)
+        if key not in plugins.LOADED and BUILT_IN.get(name) is not type(value):
             if name in BUILT_IN:
                 raise BoardError(f'{type(value).__name__}: kind {name!r}, expected another one '
                                  'than that of a built-in board')
-            plugins.GIVEN[name] = type(value)
+            plugins.GIVEN[key] = type(value)
         return value
     fields = {'kind': value} if isinstance(value, str) else value
     if not isinstance(fields, Mapping) or not isinstance(kind := fields.get('kind'), str):

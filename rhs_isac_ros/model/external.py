@@ -30,7 +30,7 @@ class External(abc.ABC):
         A value without an origin is one of this process, or of the process that runs the job.
         Raises ValueError if there is no valid value or the digest differs.
         """
-        if isinstance(held := plugins.GIVEN.get(text, plugins.HELD.get(text)), cls):
+        if isinstance(held := plugins.GIVEN.get(('', text), plugins.HELD.get(text)), cls):
             return held
         origin, expected = re.fullmatch(  # type: ignore[union-attr]
             r'(.*?)(?:@([0-9a-f]{16}))?', text, re.DOTALL).groups()

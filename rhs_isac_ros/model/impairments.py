@@ -329,7 +329,8 @@ def nuisance_of(scenario: Scenario) -> Nuisance:
 
 def _given(scenario: Scenario) -> tuple[Any, ...]:
     """Return objects in place of names; a notebook may define a class of one name again."""
-    return tuple(plugins.GIVEN.get(name) for name, _ in scenario.impairments)
+    return tuple(plugins.GIVEN.get(plugins.key_of(plugins.IMPAIRMENTS, name))
+                 for name, _ in scenario.impairments)
 
 
 @functools.lru_cache(maxsize=16)

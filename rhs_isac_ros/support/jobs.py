@@ -164,12 +164,14 @@ def _digest(*files: str, text: str) -> str:
 
 @one_blas_thread
 def attempt(function: Function, job: Job,
-            given: Mapping[str, Any] = MappingProxyType({})) -> JobResult:
+            given: Mapping[tuple[str, str], Any] = MappingProxyType({})) -> JobResult:
     """Run a job in this process; return errors as text, because some errors cannot be pickled.
 
-    `given` are objects of the process that wants the result, to which names of plug-ins refer.
+    `given` are objects of the process that wants the result, to which names of plug-ins refer, by
+    `plugins.key_of`.
     """
-    plugins.GIVEN.update((name, one) for name, one in given.items() if name not in plugins.HELD)
+    plugins.GIVEN.update(
+        (key, one) for key, one in given.items() if key[1] not in plugins.HELD)
     try:
         result = function(**job.arguments)
         if not isinstance(result, Mapping):
@@ -351,7 +353,8 @@ class _Entry:
     function: Function
     job: Job
     record: Mapping[str, Any]  # What the result depends on.
-    given: Mapping[str, Any]  # Objects of this process to which names in the arguments refer.
+    # Objects of this process to which names in the arguments refer.
+    given: Mapping[tuple[str, str], Any]
     result: dict[str, Any] | None = None
     waiting: list[int] = dataclasses.field(default_factory=list)
 
@@ -405,9 +408,9 @@ class _State:
     def _admitted(self, function: Function, job: Job) -> _Entry:
         """Return a job, which is ready to run if it is new and has no stored result."""
         text = json.dumps(job.arguments)
-        given = {**plugins.GIVEN, **dict(plugins.HELD.items())}
-        used = {name: plugin for name, plugin in (plugins.LOADED | given).items()
-                if json.dumps(name) in text}
+        given = plugins.GIVEN | {('', name): one for name, one in plugins.HELD.items()}
+        used = {key: plugin for key, plugin in (plugins.LOADED | given).items()
+                if json.dumps(key[1]) in text}
         if (key := (id(function), *used)) not in self._sources:
             self._sources[key] = sources_of(function, *used.values())
         record = {'sources': self._sources[key], 'arguments': dict(job.arguments)}
@@ -416,7 +419,7 @@ class _State:
                 raise ValueError(f'jobs: two have the name {job.name}, expected unique names')
             return known
         entry = self.entries[job.name] = _Entry(function, job, record, {
-            name: plugin for name, plugin in used.items() if name in given})
+            key: plugin for key, plugin in used.items() if key in given})
         if self._folder:
             self._files.add(file := _file(self._folder, job))
             entry.result = _stored(file, record)
@@ -461,7 +464,8 @@ class _AbandonedError(BaseException):
     """Nobody waits for a job any more."""
 
 
-def _attempt_on_cluster(function: Function, job: Job, given: Mapping[str, Any]) -> JobResult:
+def _attempt_on_cluster(
+        function: Function, job: Job, given: Mapping[tuple[str, str], Any]) -> JobResult:
     """Run a job on a worker of a Dask cluster; end it if its client has ended.
 
     Dask itself only forgets such a job, which would occupy the worker until its end.

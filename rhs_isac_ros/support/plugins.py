@@ -44,11 +44,16 @@ def describe(group: str, name: Any) -> str:
         for point in _entry_points(group=group, name=name)))
 
 
-#: Objects that callers have given in place of names, by ``module:name``; loaded ones by name.
-GIVEN: dict[str, Any] = {}
-LOADED: dict[str, Any] = {}
+#: Objects that callers have given in place of names, and loaded ones; see `key_of`.
+GIVEN: dict[tuple[str, str], Any] = {}
+LOADED: dict[tuple[str, str], Any] = {}
 #: Objects without a name that scenarios of this process contain, by their texts.
 HELD: weakref.WeakValueDictionary[str, Any] = weakref.WeakValueDictionary()
+
+
+def key_of(group: str, name: str) -> tuple[str, str]:
+    """Return a group and a name; the group of ``module:name``, which has one object, is empty."""
+    return '' if is_reference(name) else group, name
 
 
 def is_reference(name: Any) -> bool:
@@ -64,7 +69,7 @@ def name_of(plugin: Any) -> str:
         raise PluginError(f'{plugin!r}, expected a name, a class or a callable')
     name = (f'{getattr(plugin, "__module__", "?")}:'
             f'{getattr(plugin, "__qualname__", type(plugin).__qualname__)}')
-    GIVEN[name] = plugin
+    GIVEN[key_of('', name)] = plugin
     return name
 
 
@@ -78,8 +83,9 @@ def load(group: str, plugin: Any, base: type | None = None) -> Any:
     and its import succeeds.
     """
     name = name_of(plugin)
-    if name in GIVEN:
-        return GIVEN[name]
+    key = key_of(group, name)
+    if key in GIVEN:
+        return GIVEN[key]
     module, is_named, attribute = name.partition(':')
     if base and is_named and module.partition('.')[0] in sys.stdlib_module_names:
         raise PluginError(f'{name}: expected a module outside of the standard library')
@@ -98,7 +104,7 @@ def load(group: str, plugin: Any, base: type | None = None) -> Any:
     if base and is_named and not isinstance(found, base) and not (
             isinstance(found, type) and issubclass(found, base)):
         raise PluginError(f'{name}: {found!r}, expected a subclass of {base.__name__}')
-    LOADED[name] = found
+    LOADED[key] = found
     return found
 
 

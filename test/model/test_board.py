@@ -212,6 +212,17 @@ def test_plug_ins_that_differ_in_a_field_are_different_boards():
     assert board.paths(ports_of(Scenario())).all()
 
 
+def test_a_board_and_a_plug_in_of_another_group_may_have_one_name(install):
+    class Ring(Paper):
+        kind = 'ring'
+
+    install('rings', 'def ring(): return 1', {plugins.MOBILITIES: {'ring': 'ring'}})
+    before = plugins.load(plugins.MOBILITIES, 'ring')
+    scenario = Scenario(board=Ring(masked=(0, 3)))
+    assert plugins.load(plugins.MOBILITIES, 'ring') is before
+    assert Scenario(**scenario.changes()).board == scenario.board
+
+
 COUPLED = '''
 import numpy as np
 from rhs_isac_ros.model.board import Board
