@@ -68,8 +68,9 @@ class Board(abc.ABC):
     #: Whether the coefficient of an element is its tuning, apart from a constant factor.
     is_amplitude: ClassVar[bool] = False
 
-    def __init_subclass__(cls) -> None:
+    def __init_subclass__(cls, **options: Any) -> None:
         """Let methods raise BoardError if their results have wrong shapes, types or values."""
+        super().__init_subclass__(**options)
         for name in ('transfer', 'pullback', 'coefficients', 'slopes'):
             if name in vars(cls):
                 setattr(cls, name, _checked(name, vars(cls)[name]))
@@ -203,9 +204,9 @@ class Board(abc.ABC):
 def _checked(name: str, method: Callable[..., Any]) -> Callable[..., np.ndarray]:
     """Return a method of a board, with a name, that checks its result."""
     @functools.wraps(method)
-    def checked(self: Board, ports: Ports, tunings: np.ndarray, *others: np.ndarray
-                ) -> np.ndarray:
-        found = method(self, ports, tunings, *others)
+    def checked(self: Board, ports: Ports, tunings: np.ndarray, *others: np.ndarray,
+                **named: np.ndarray) -> np.ndarray:
+        found = method(self, ports, tunings, *others, **named)
         (n_bands, n_subbands), frames = ports.frequencies_hz.shape, tunings.shape[1:]
         coefficients = [(n, m, *frames) for n in (n_bands, len(tunings)) for m in (n_subbands, 1)]
         shapes: dict[str, list[tuple[int, ...]]] = {

@@ -158,6 +158,15 @@ def test_a_band_alone_has_its_part_of_the_transfer(board):
         scenario.board.transfer(ports_of(scenario), tunings)[1])
 
 
+def test_methods_of_a_board_take_their_arguments_by_name():
+    sizes = Scenario().sizes
+    tunings = np.ones((2, 1, len(PORTS.elements_m)))
+    by_transfer = np.ones((2, sizes['N_SB'], *tunings.shape[1:], sizes['K']))
+    np.testing.assert_array_equal(
+        Paper().pullback(ports=PORTS, tunings=tunings, by_transfer=by_transfer),
+        Paper().pullback(PORTS, tunings, by_transfer))
+
+
 @pytest.mark.parametrize('kind', ['phase', 'resonant', 'states'])
 def test_a_focused_beam_is_in_phase_at_its_point(kind):
     scenario = scenario_with(BOARDS[kind])
