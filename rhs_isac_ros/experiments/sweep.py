@@ -28,6 +28,7 @@ from rhs_isac_ros.link import capacity as capacity_of
 from rhs_isac_ros.link import capacity_report, choose_beam
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import Estimator, EstimatorKind, make_estimator
+from rhs_isac_ros.positioning.estimate import estimate_of
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.fields import whole
 from rhs_isac_ros.support.jobs import Job, Strand, Workers
@@ -109,7 +110,8 @@ def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, An
     positions, received = system.pairs(n, seed, first)
     if family == CRLB:
         return {'crlb_m2': system.crlb(positions).tolist()}
-    located = _estimator(estimator, json.dumps(scenario), json.dumps(codebook)).estimate(received)
+    located = estimate_of(
+        _estimator(estimator, json.dumps(scenario), json.dumps(codebook)), received)
     fix = located.fix
     from scipy.special import chdtri
     # Without a fix, only the region is known.

@@ -14,6 +14,7 @@ from rhs_isac_ros.model import simulate_received
 from rhs_isac_ros.model.geometry import undeclared_movement
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning.alternatives import unrecognised_outside
+from rhs_isac_ros.positioning.estimate import estimate_of
 from rhs_isac_ros.positioning.site import LEFT_OUT
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
@@ -84,7 +85,7 @@ class PositionerNode(LocatingNode[Positioner]):
             **options, **kind.parse(settings.estimator_options)})
         # The first estimate takes longer than later ones; no user should have to wait for it.
         center = np.array([self.scenario.roi_center_m])
-        estimator.estimate(simulate_received(
+        estimate_of(estimator, simulate_received(
             self.scenario, codebook, center, np.random.default_rng(0))[0])
         for cell in self.library.codebooks[:1]:
             # The same applies to the first estimator without a table, whose imports take a second.

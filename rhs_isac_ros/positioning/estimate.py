@@ -12,6 +12,7 @@ from rhs_isac_ros.model.arrays import numbers, position_problem
 from rhs_isac_ros.model.gaussian import symmetric
 from rhs_isac_ros.positioning.mixture import Mixture, with_velocities
 from rhs_isac_ros.positioning.sheets import Sheets
+from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import finite
 from rhs_isac_ros.support.plugins import PluginError
 
@@ -138,10 +139,10 @@ class Estimate:
     frame: str = SURFACE  #: ``surface`` or ``site``: the frame of the mean and the velocity.
 
     def __post_init__(self) -> None:
-        """Raise ValueError unless the shapes of mean and covariance agree."""
-        mean = numbers('mean', self.mean, shapes=[(3,), ('N', 3)], finite=False)
-        covariance = numbers(
-            'covariance', self.covariance, shapes=[(*mean.shape, 3)], finite=False)
+        """Raise PluginError, a ValueError, unless the shapes of mean and covariance agree."""
+        mean = numbers('mean', self.mean, error=PluginError, shapes=[(3,), ('N', 3)], finite=False)
+        covariance = numbers('covariance', self.covariance, error=PluginError,
+                             shapes=[(*mean.shape, 3)], finite=False)
         object.__setattr__(self, 'mean', mean)
         object.__setattr__(self, 'covariance', covariance)
 
@@ -302,6 +303,20 @@ class Estimator(Protocol):
         estimate in a batch is that of the same shot alone, apart from rounding.
         """
         ...
+
+
+def estimate_of(estimator: Estimator, received: np.ndarray) -> Estimate:
+    """Return the estimate of an estimator; see `Estimator.estimate`.
+
+    Raises SignalError as the estimator does, and PluginError if it returns anything but an
+    `Estimate` with one position for each shot.
+    """
+    with translated(PluginError, PluginError, f'{type(estimator).__name__}.estimate'):
+        found = estimator.estimate(received)
+        expected = (*np.shape(received)[:-2], 3)
+        if not isinstance(found, Estimate) or found.mean.shape != expected:
+            raise PluginError(f'{found!r}, expected an Estimate with means {list(expected)}')
+    return found
 
 
 def regular(covariances: np.ndarray) -> np.ndarray:

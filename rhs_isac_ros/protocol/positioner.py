@@ -24,6 +24,7 @@ from rhs_isac_ros.positioning import (
 )
 from rhs_isac_ros.positioning.alternatives import describe_doubts, probabilities_of
 from rhs_isac_ros.positioning.diagnosis import WINDOW, InnovationTest, diagnose
+from rhs_isac_ros.positioning.estimate import estimate_of
 from rhs_isac_ros.positioning.tracking import MAX_GAP_S
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
@@ -33,6 +34,7 @@ from rhs_isac_ros.protocol.fusion import posterior_of
 from rhs_isac_ros.protocol.role import CodebookCache, NewestDict, Role
 from rhs_isac_ros.protocol.settings import TRACK, PendingSettings, PositionerSettings
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
+from rhs_isac_ros.support.plugins import PluginError
 from rhs_isac_ros.support.texts import MAX_LISTED, counted
 from rhs_isac_ros.system import System
 
@@ -91,7 +93,7 @@ class Tracks:
             del self._tracks[next(iter(self._tracks))]
         track = self._tracks.get(received.user)
         if not isinstance(estimator, SearchEstimator) or track and track.is_late(received):
-            return estimator.estimate(signals)
+            return estimate_of(estimator, signals)
         if track is None or not track.may_continue(received, now_s):
             track = _Track(Tracker(estimator, Motion(speed_mps)), received, now_s)
         track.tracker.estimator = estimator
@@ -363,11 +365,11 @@ class Positioner(Role):
         begin = self._stopwatch()
         try:
             estimate = self._estimate(received, job.settings, estimator, now_s)
-        except SignalError as error:
+        # A plug-in may return anything.
+        except (SignalError, PluginError) as error:
             self._no_fix(received, str(error))
             return
         latency_s = self._stopwatch() - begin
-        # A plug-in may return any position.
         problem = position_problem(np.asarray(estimate.mean)) if estimate.fix else ''
         probabilities = {f'{name}_probability': value
                          for name, value in probabilities_of(estimate).items()}
@@ -400,7 +402,7 @@ class Positioner(Role):
         self._tracks.clear()
         if self._is_observed() and isinstance(estimator, SearchEstimator):
             return estimator.posterior(received.stacked)
-        return estimator.estimate(received.stacked)
+        return estimate_of(estimator, received.stacked)
 
     def _publish_track(self, received: m.ReceivedSignals, estimate: Estimate) -> None:
         user, loss = received.user, _Loss.BLOCKED if estimate.is_predicted else None

@@ -1,5 +1,7 @@
 """What the methods of users' objects return: it is checked where it enters the package."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,8 @@ from rhs_isac_ros.model.elementwise import Elementwise
 from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.surface import ports_of
 from rhs_isac_ros.positioning import Estimate, estimate_each
+from rhs_isac_ros.positioning.estimate import estimate_of
+from rhs_isac_ros.support import plugins
 from rhs_isac_ros.system import System
 
 SIZES = {'elements_per_side': 4, 'n_subbands': 3, 'n_frames': 2}
@@ -69,6 +73,15 @@ RESULTS = {
 # What is valid: signals on further axes, and positions that are not known.
 VALID = {'signals': {'another axis', 'not finite'}, 'mean': {'not finite'},
          'covariance': {'not finite'}}
+
+
+@pytest.mark.parametrize(('n', 'found'), [
+    ((), None), ((), Estimate(np.ones((1, 3)), np.ones((1, 3, 3)))), ((1,), np.ones((1, 3))),
+    ((1,), Estimate(np.ones(3), np.eye(3))), ((0,), Estimate(np.ones((1, 3)), np.eye(3)[None]))])
+def test_an_estimator_returns_an_estimate_for_each_shot(n, found):
+    shape = re.escape(str([*n, 3]))
+    with pytest.raises(plugins.PluginError, match=f'^Own.estimate: .* with means {shape}'):
+        estimate_of(own((), estimate=found)(), np.ones((*n, 2, 6)))
 
 
 @pytest.mark.parametrize('name', RESULTS)

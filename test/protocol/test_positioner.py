@@ -229,7 +229,14 @@ def raises(received):
     (lambda received: Estimate(*NOTHING, 'received: all wrong'), 'received: all wrong'),
     # A plug-in may return any position.
     (lambda received: Estimate(PLACE * [-1, 1, 1], np.eye(3)),
-     'position: x = -8 m, expected x > 0')])
+     'position: x = -8 m, expected x > 0'),
+    # And anything else.
+    (lambda received: None,
+     'Fixed.estimate: None, expected an Estimate with means [3]'),
+    (lambda received: Estimate(PLACE[None], np.eye(3)[None]),
+     'Fixed.estimate: <1 estimates, 1 with a position>, expected an Estimate with means [3]'),
+    (lambda received: Estimate(PLACE[:2], np.eye(3)),
+     'Fixed.estimate: mean: shape (2,), expected [3] or [N, 3]')])
 def test_without_a_fix_the_positioner_reports_the_reason(
         positioner, codebooks, example, offer, estimate, reason):
     offer(0)
