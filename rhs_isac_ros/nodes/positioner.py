@@ -15,7 +15,7 @@ from rhs_isac_ros.model.geometry import undeclared_movement
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning.alternatives import unrecognised_outside
 from rhs_isac_ros.positioning.estimate import estimate_of
-from rhs_isac_ros.positioning.site import LEFT_OUT
+from rhs_isac_ros.positioning.site import share_left_out
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
@@ -80,7 +80,7 @@ class PositionerNode(LocatingNode[Positioner]):
         options = kind.accepted(
             table_folder=self.table_folder, model_file=settings.model_file,
             reject_outside=settings.reject_outside, progress=self._on_progress,
-            **({'left_out': LEFT_OUT} if self.surface.site else {}))
+            left_out=share_left_out(self.surface.site))
         estimator = kind.create(System(self.scenario, codebook, surface), **{
             **options, **kind.parse(settings.estimator_options)})
         # The first estimate takes longer than later ones; no user should have to wait for it.

@@ -14,16 +14,19 @@ import yaml
 from rhs_isac_ros.model import Pose, Scenario
 from rhs_isac_ros.model.arrays import checked_bounds
 from rhs_isac_ros.positioning.agreement import Pair, pair_agreements
-from rhs_isac_ros.positioning.estimate import SITE, Estimate, Sighting, SignalError
+from rhs_isac_ros.positioning.estimate import (
+    MISS_PROBABILITY,
+    SITE,
+    Estimate,
+    Sighting,
+    SignalError,
+)
 from rhs_isac_ros.positioning.estimators import BayesEstimator
 from rhs_isac_ros.positioning.fusion import Fuser, fuse
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.files import mapping_of, read_yaml
 from rhs_isac_ros.system import System, SystemFiles
 
-# Share of the posterior of a surface that its modes may leave out. The only modes on which all
-# surfaces agree may be unlikely for each of them.
-LEFT_OUT = 5e-5
 # Number of decimals of regions [m], and tolerance of their comparisons [m].
 _DECIMALS, _TOLERANCE_M = 6, 2e-6
 
@@ -118,6 +121,15 @@ class Site:
                 for name, one in self.surfaces.items()}
 
 
+def share_left_out(site: object) -> float:
+    """Return the share of a surface's posterior that modes may have which are left out.
+
+    In a site, the only modes on which all surfaces agree may be unlikely for each of them. The
+    argument is true for a surface of a site.
+    """
+    return 5e-5 if site else MISS_PROBABILITY
+
+
 class SiteEstimator:
     """The position of a user of a site, from the signals of one cycle.
 
@@ -127,7 +139,7 @@ class SiteEstimator:
     def __init__(self, site: Site, table_folder: str | Path | None = None) -> None:
         self._site = site
         self._estimators = {name: BayesEstimator(
-            one, table_folder, reject_outside=True, left_out=LEFT_OUT)
+            one, table_folder, reject_outside=True, left_out=share_left_out(site))
                             for name, one in site.surfaces.items()}
 
     def sightings(self, received: Mapping[str, np.ndarray]) -> dict[str, Sighting]:

@@ -27,6 +27,7 @@ from rhs_isac_ros.positioning import (
     Site,
     fuse,
 )
+from rhs_isac_ros.positioning.site import share_left_out
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Tracks
@@ -124,8 +125,9 @@ def locate_in_site(
     # In the order of the node `fusion`.
     names, leader = sorted(filter(None, recording.logs)), recording.scenarios['']
     posteriors = [_estimates(recording, alone({
-        codebook_id: BayesEstimator(System(recording.scenarios[name], codebook), table_folder,
-                                    reject_outside=True).posterior
+        codebook_id: BayesEstimator(
+            System(recording.scenarios[name], codebook), table_folder, reject_outside=True,
+            left_out=share_left_out(name)).posterior
         for codebook_id, codebook in _codebooks(recording, name).items()}), name)
         for name in names]
     again: dict[str, _Positions] = {name: {} for name in (*names, '')}
@@ -233,7 +235,7 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
     surface = load_surface(str(options.calibration or ''), scenario)
     for kind, further in options.estimator:
         accepted = kind.accepted(table_folder=default_folder(), model_file=options.model or '',
-                                 reject_outside=True) | further
+                                 reject_outside=True, left_out=share_left_out(leader)) | further
         estimators = {codebook_id: kind.create(System(scenario, codebook, surface), **accepted)
                       for codebook_id, codebook in codebooks.items()}
         rows.append(_row(kind.name, recording, locate(recording, alone({

@@ -47,6 +47,7 @@ from rhs_isac_ros.frontend import Air, EmulatedRadio, Radio, WaveformRadio
 from rhs_isac_ros.model import Pose, Scenario, ScenarioError
 from rhs_isac_ros.model.mobility import RandomWalk
 from rhs_isac_ros.positioning import BayesEstimator, Estimate, Mixture, Sighting, Tracker, fuse
+from rhs_isac_ros.positioning.site import share_left_out
 from rhs_isac_ros.positioning.tracking import MixtureTracker, Motion
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.arguments import output_file
@@ -188,7 +189,7 @@ class Surface:
         self._library = adapted(setting.library(), self.scenario)
         self._states = System.from_yaml(
             frame.CONFIG / 'lab_walk_system.yaml').surface if setting.walks else None
-        self._make_radio = setting.radio
+        self._make_radio, self._left_out = setting.radio, share_left_out(len(setting.poses) > 1)
         self.estimator = functools.cache(self._estimator)
 
     def codebook_at(self, predicted: tuple[np.ndarray, np.ndarray] | None) -> Codebook:
@@ -211,7 +212,8 @@ class Surface:
     def _estimator(self, codebook: Codebook) -> BayesEstimator:
         # The positioner creates the estimators of a library like this, too.
         return BayesEstimator(System(self.scenario, codebook, self._states),
-                              reject_outside=True, lazy=codebook is not self.codebook)
+                              reject_outside=True, lazy=codebook is not self.codebook,
+                              left_out=self._left_out)
 
 
 def adapted(library: Library, scenario: Scenario) -> Library:
