@@ -47,7 +47,8 @@ class PositionerNode(LocatingNode[Positioner]):
         self.endings.callback(self._worker.close)
         self.start(
             Positioner(self.scenario, time.perf_counter, settings,
-                       lambda: self.is_observed(m.Posterior), self.library), subscribe=False)
+                       lambda: self.is_observed(m.Posterior), self.library,
+                       share_left_out(self.surface.site)), subscribe=False)
 
     def make_settings(self, values: types.SimpleNamespace) -> PositionerSettings:
         """Return the settings; raise ParameterError if they, a file or a plug-in cannot be used.

@@ -127,9 +127,8 @@ class SearchEstimator(abc.ABC):
         scenario = system.scenario
         self._likelihood = likelihood = Likelihood(system)
         self._rejects_outside = reject_outside and bool(scenario.outside_probability)
-        # Margin of the search beyond the usual one.
-        self._margin = float(np.log(MISS_PROBABILITY / Field(
-            float, low=1e-12, high=MISS_PROBABILITY).checked('left_out', left_out)))
+        self.left_out: float = Field(
+            float, low=1e-12, high=MISS_PROBABILITY).checked('left_out', left_out)
         self._load = functools.partial(
             load_table, system, table_folder, progress, model=likelihood.model)
         prior, n_measurements = likelihood.nuisance, likelihood.model.n_whitened
@@ -367,7 +366,8 @@ class SearchEstimator(abc.ABC):
               whitened: np.ndarray, draws: bool) -> list['_Searched']:
         """Find the posterior of each shot."""
         # Margin of modes in each cell, beyond the usual one.
-        margin = self._margin + self._refinement.margin + PRIOR_MARGIN * scope.favoured
+        margin = (np.log(MISS_PROBABILITY / self.left_out) + self._refinement.margin
+                  + PRIOR_MARGIN * scope.favoured)
         starts, drawn = scope.table.search(
             whitened, self._likelihood.nuisance, GRID_MARGIN + scope.alignment.margin + margin,
             scope.drawn.fit if scope.drawn and draws else None)

@@ -24,7 +24,7 @@ from rhs_isac_ros.positioning import (
 )
 from rhs_isac_ros.positioning.alternatives import describe_doubts, probabilities_of
 from rhs_isac_ros.positioning.diagnosis import WINDOW, InnovationTest, diagnose
-from rhs_isac_ros.positioning.estimate import estimate_of
+from rhs_isac_ros.positioning.estimate import MISS_PROBABILITY, estimate_of
 from rhs_isac_ros.positioning.tracking import MAX_GAP_S
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
@@ -222,8 +222,9 @@ class Positioner(Role):
     `is_observed` whether anyone receives posteriors, which take a moment to convert.
 
     Estimates from a track propose the codebook of the `library` for the predicted position. The
-    estimator of such a codebook is created when it is first used. Its table of the region is
-    computed in the background, or when a track does not explain the signals, or there is none.
+    estimator of such a codebook, with the option `left_out`, is created when it is first used. Its
+    table of the region is computed in the background, or when a track does not explain the
+    signals, or there is none.
     """
 
     SENDS = (m.PositionEstimate, m.Posterior, m.NoFix)
@@ -232,9 +233,10 @@ class Positioner(Role):
     def __init__(
             self, scenario: Scenario, stopwatch: Callable[[], float],
             settings: PositionerSettings | None = None,
-            is_observed: Callable[[], bool] = lambda: False, library: Library = EMPTY) -> None:
+            is_observed: Callable[[], bool] = lambda: False, library: Library = EMPTY,
+            left_out: float = MISS_PROBABILITY) -> None:
         super().__init__()
-        self._library = library
+        self._library, self._left_out = library, left_out
         self._scenario, self._stopwatch = scenario, stopwatch
         self._is_observed = is_observed
         self._settings = PendingSettings(settings or PositionerSettings())
@@ -319,7 +321,7 @@ class Positioner(Role):
         if cell and settings.prior == TRACK and codebook_id not in self._estimators:
             estimator = BayesEstimator(
                 System(self._scenario, cell, self._surface),
-                reject_outside=settings.reject_outside, lazy=True)
+                reject_outside=settings.reject_outside, lazy=True, left_out=self._left_out)
             self._put(_Job(cell, settings), estimator)
             self.act(events.PrepareEstimator(estimator))
         return codebook_id in self._estimators

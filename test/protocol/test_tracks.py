@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from in_memory_network import LATENCY_S, Fault, Network
+from in_memory_network import LATENCY_S, Fault, Network, feed
 
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.codebook.library import EMPTY, Library, Plan
@@ -11,8 +11,14 @@ from rhs_isac_ros.model.mobility import Waypoints
 from rhs_isac_ros.positioning import BayesEstimator
 from rhs_isac_ros.positioning.tracking import MAX_GAP_S
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import PauseRequested, ResumeRequested
-from rhs_isac_ros.protocol.positioner import Tracks
+from rhs_isac_ros.protocol.events import (
+    CodebookOffered,
+    EstimatorBuilt,
+    PauseRequested,
+    PrepareEstimator,
+    ResumeRequested,
+)
+from rhs_isac_ros.protocol.positioner import Positioner, Tracks
 from rhs_isac_ros.protocol.settings import PositionerSettings
 from rhs_isac_ros.system import System
 
@@ -268,3 +274,17 @@ def test_signals_of_a_cell_without_a_track_are_searched_in_the_whole_region(
         signals=drawn.reshape(cell.digital.shape[:3])))
     (estimate,) = network.sent(m.PositionEstimate)[before:]
     assert np.linalg.norm(estimate.position - PLACE) < 1.5
+
+
+def test_estimators_of_a_library_leave_out_as_few_modes_as_the_positioner_does(
+        scenario, region, library, estimator):
+    """In a site, for example."""
+    role, cell = Positioner(scenario, lambda: 0.0, TRACK, library=library,
+                            left_out=5e-5), library.codebooks[0]
+    feed(role, [CodebookOffered(region), EstimatorBuilt(region, estimator)])
+    (signals,) = MeasurementModel(scenario, cell).sample(PLACE[None], np.random.default_rng(0))
+    actions = role.handle(m.ReceivedSignals(
+        cycle_id=3, user=2, user_instance=7, codebook_id=cell.id, stamp_ns=5,
+        signals=signals.reshape(cell.shape[:3])), 1.0)
+    (prepared,) = (one for one in actions if isinstance(one, PrepareEstimator))
+    assert prepared.estimator.left_out == 5e-5
