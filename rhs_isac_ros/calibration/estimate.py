@@ -156,9 +156,8 @@ def log_evidence(model: MeasurementModel, pilots: Pilots) -> np.ndarray:
     log_gain = np.sum(np.log(np.abs(nuisance.divide(np.ones_like(mean), values))), axis=(1, 2))
     curvature = 4 * gains @ gains.T + _curvature(
         nuisance, model.whiten(nuisance.derivatives(aligned, mean, share)))
-    evidence: np.ndarray = 2 * (log_gain - log_root) - energy - (
+    return 2 * (log_gain - log_root) - energy - (
         values**2 @ nuisance.precision + np.linalg.slogdet(curvature)[1]) / 2
-    return evidence
 
 
 def _aligned(model: MeasurementModel, pilots: Pilots
@@ -195,7 +194,12 @@ def estimate_surface(
         changes.append(_change(before, posterior, n_bands))
         if changes[-1] < TOLERANCE:
             break
-    return _result(posterior, gains), changes
+    mean, n = posterior.mean, scenario.n_elements
+    values, vectors = np.linalg.eigh(posterior.covariance)
+    kept = values > _MIN_VARIANCE * max(values[-1], 0.0)
+    return SurfaceEstimate(
+        mean[:n], mean[n:2 * n], gains, vectors[:, kept] * np.sqrt(values[kept]),
+        posterior.failed_probability), changes
 
 
 def initial_values(nuisance: Nuisance, white: np.ndarray, white_mean: np.ndarray) -> np.ndarray:
@@ -257,15 +261,6 @@ def _change(before: SurfacePosterior, after: SurfacePosterior, n_bands: int) -> 
     moved[-n_bands:] = np.abs(after.mean[-n_bands:])
     std = np.sqrt(np.maximum(np.diagonal(after.covariance).real, 1e-300))
     return float(np.max(moved / np.maximum(std, 1e-9)))
-
-
-def _result(posterior: SurfacePosterior, band_gains: np.ndarray) -> SurfaceEstimate:
-    mean, n = posterior.mean, len(posterior.failed)
-    values, vectors = np.linalg.eigh(posterior.covariance)
-    kept = values > _MIN_VARIANCE * max(values[-1], 0.0)
-    return SurfaceEstimate(
-        mean[:n], mean[n:2 * n], band_gains, vectors[:, kept] * np.sqrt(values[kept]),
-        posterior.failed_probability)
 
 
 class PilotStatistics:

@@ -59,8 +59,9 @@ class Plan:
         """Return all cells, in the frame of the surface."""
         cells = []
         for spread_m, pitch_m in zip(self.spreads_m, self.pitches_m, strict=True):
+            numbers = [max(int(np.ceil(size / pitch_m - 1e-9)), 1) for size in scenario.roi_size_m]
             lines = [low + (np.arange(n) + 0.5) * (high - low) / n for low, high, n in zip(
-                *scenario.roi_bounds_m, _numbers(scenario, pitch_m), strict=True)]
+                *scenario.roi_bounds_m, numbers, strict=True)]
             cells += [Cell(centre, spread_m) for centre in itertools.product(*lines)]
         return cells
 
@@ -237,8 +238,3 @@ def codebooks_of(scenario: Scenario, cells: Sequence[Cell], start: Codebook, obj
     jobs = [optimisation(scenario, objective=objective, n_positions=_N_POSITIONS, start=start,
                          max_steps=_STEPS, cell=cell) for cell in cells]
     return [result_of(found).codebook for found in (yield optimised, jobs)]
-
-
-def _numbers(scenario: Scenario, pitch_m: float) -> list[int]:
-    """Return the numbers of cells along each axis."""
-    return [max(int(np.ceil(size / pitch_m - 1e-9)), 1) for size in scenario.roi_size_m]

@@ -75,7 +75,10 @@ def estimate(options: argparse.Namespace, scenario: Scenario,
     """
     try:
         if options.states:
-            return _save(known_states(scenario, *options.states), options.output)
+            calibration = known_states(scenario, *options.states)
+            save_or_rescue(calibration.save, options.output)
+            print(f'{options.output}: calibration {calibration.id}')
+            return
         pilots = [_arrays(options, scenario)] if pilots is None else pilots
         with unfinished(options.output, options) as workers:
             if options.board is not None:
@@ -118,11 +121,6 @@ def _compare(scenario: Scenario, pilots: Sequence[Pilots], workers: Workers,
 
 def _board_text(plain: object) -> str:
     return yaml.safe_dump(plain, default_flow_style=True, width=10**6).split('\n')[0]
-
-
-def _save(calibration: Calibration, output: Path) -> None:
-    save_or_rescue(calibration.save, output)
-    print(f'{output}: calibration {calibration.id}')
 
 
 def _arrays(options: argparse.Namespace, scenario: Scenario) -> Pilots:

@@ -72,8 +72,7 @@ def make_radio(name: str, scenario: Scenario, air: Air, **options: Any) -> Radio
     the scenario; and PluginError if a plug-in cannot be loaded, fails, or does not return a radio.
     No hardware is used before the first `capture`.
     """
-    radio: Radio = _make(Radio, RADIOS, plugins.RADIOS, name, scenario, air, **options)
-    return radio
+    return _make(Radio, RADIOS, plugins.RADIOS, name, scenario, air, **options)
 
 
 def _make(kind: type, built_in: Mapping[str, Callable[..., Any]], group: str, name: str,

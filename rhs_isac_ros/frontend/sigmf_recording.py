@@ -261,8 +261,7 @@ class PlaybackRadio:
             raise EOFError(f'{self._path}: all {self._n_cycles} cycles are played')
         if band not in self._cycle:
             raise LookupError(f'{self._path}: band {band} is missing in cycle {self._n_cycles}')
-        samples: np.ndarray = self._cycle[band].captures[self._air.frame]
-        return samples
+        return self._cycle[band].captures[self._air.frame]
 
     def close(self) -> None:
         """Return to the beginning."""

@@ -41,15 +41,13 @@ def multiply_rows(matrices: np.ndarray, rows: np.ndarray) -> np.ndarray:
     A row is rounded in the same way among any number of other rows.
     """
     # BLAS rounds by the sizes of a product, so each row has a product of its own.
-    products: np.ndarray = np.matmul(matrices, rows[..., None])[..., 0]
-    return products
+    return np.matmul(matrices, rows[..., None])[..., 0]
 
 
 def evenly_spread(n: int) -> np.ndarray:
     """Return numbers between 0 and 1 of which any part is evenly spread, float64 [n]."""
     # Multiples of the golden ratio, modulo 1.
-    levels: np.ndarray = (np.arange(n) + 0.5) * 0.6180339887498949 % 1
-    return levels
+    return (np.arange(n) + 0.5) * 0.6180339887498949 % 1
 
 
 def mixture_weights(log_weights: np.ndarray, axis: int | tuple[int, ...] = -1

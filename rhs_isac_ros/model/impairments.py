@@ -399,5 +399,4 @@ def _installed(scenario: Scenario) -> tuple[Impairment, ...]:
 
 @functools.lru_cache(maxsize=16)
 def _load(name: str, strength: float, given: Any) -> Impairment:
-    made: Impairment = plugins.make(plugins.IMPAIRMENTS, name, Impairment, strength, in_file=True)
-    return made
+    return plugins.make(plugins.IMPAIRMENTS, name, Impairment, strength, in_file=True)

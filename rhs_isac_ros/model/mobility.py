@@ -190,6 +190,5 @@ def make_plugin(
     position. Raises PluginError if there is no such plug-in, it fails, or it does not return a
     mobility.
     """
-    mobility: Mobility = plugins.make(
+    return plugins.make(
         plugins.MOBILITIES, name, Mobility, scenario, speed_mps, rng, start)
-    return mobility

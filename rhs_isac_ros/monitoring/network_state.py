@@ -72,8 +72,13 @@ class Overview:
             case m.ProtocolState():
                 phase = RESTING if message.outcome else message.phase.name.lower()
                 self._set_phase(phase, message.cycle_id, message.user, now_s)
-                if message.outcome:
-                    self._end_cycle(message, now_s)
+                if message.outcome == 'served':
+                    self.served += 1
+                    self._served_s.append(now_s)
+                elif message.outcome:
+                    self.given_up += 1
+                    user = f' of user {message.user}' if message.user else ''
+                    self.last_failure = f'cycle {message.cycle_id}{user}: {message.outcome}'
             case m.GroundTruth():
                 if len(self.users) < MAX_USERS:
                     self.users.setdefault(message.user, None)
@@ -108,15 +113,6 @@ class Overview:
         if (phase, cycle_id) != (self.phase, self.cycle_id):
             self.phase_began_s = now_s
         self.phase, self.cycle_id, self.user = phase, cycle_id, user
-
-    def _end_cycle(self, state: m.ProtocolState, now_s: float) -> None:
-        if state.outcome == 'served':
-            self.served += 1
-            self._served_s.append(now_s)
-        else:
-            self.given_up += 1
-            user = f' of user {state.user}' if state.user else ''
-            self.last_failure = f'cycle {state.cycle_id}{user}: {state.outcome}'
 
 
 # Types of the messages that the state of the scene uses.

@@ -14,13 +14,6 @@ from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import ParameterError
 
 
-def _make(role: str, **options: Any) -> Node:
-    """Create a node of a role; its class is named after the role."""
-    module = importlib.import_module(f'rhs_isac_ros.nodes.{role}')
-    node: Node = getattr(module, f'{role.title().replace("_", "")}Node')(**options)
-    return node
-
-
 def make_network() -> list[Node]:
     """Create all nodes of a network or a site, with users numbered from 1.
 
@@ -39,7 +32,9 @@ def make_network() -> list[Node]:
             # A rule of its own, because one of the process for the namespace applies to all nodes.
             space = f'{head.get_namespace().rstrip("/")}/{namespace}'
             options['cli_args'] = ['--ros-args', '-r', f'__ns:={space}']
-        nodes.append(_make(role, **options))
+        # The class of a node is named after its role.
+        module = importlib.import_module(f'rhs_isac_ros.nodes.{role}')
+        nodes.append(getattr(module, f'{role.title().replace("_", "")}Node')(**options))
     return nodes
 
 

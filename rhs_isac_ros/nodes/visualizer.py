@@ -27,7 +27,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from rhs_isac_ros import model
 from rhs_isac_ros.model.pose import rotation_matrix
 from rhs_isac_ros.monitoring import shapes
-from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState, SceneUser
+from rhs_isac_ros.monitoring.network_state import SCENE_RECEIVES, SceneState
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, endpoints, parameters, topics
 from rhs_isac_ros.ros.convert import to_ros
@@ -208,23 +208,20 @@ class VisualizerNode(Node):
 
         Return the time until the next call [s], which is longer if nobody receives them.
         """
-        for user in self._scene.discard_stale(time.monotonic() - self._forget_s):
-            self._paths.remove(user)
+        for number in self._scene.discard_stale(time.monotonic() - self._forget_s):
+            self._paths.remove(number)
         stamp = self.get_clock().now().to_msg()
-        for state in self._scene.users.values():
-            self._show_paths(state, stamp)
+        for number, user in self._scene.users.items():
+            # Without publishers, the zip is empty.
+            for publisher, places in zip(self._paths.publishers(number), (
+                    user.estimated_path, user.true_path), strict=False):
+                if places:
+                    endpoints.publish_if_subscribed(
+                        (publisher,), functools.partial(path, places, stamp, self._frame))
         endpoints.publish_if_subscribed((self._publisher,), lambda: self._markers(stamp))
         observed = any(one.get_subscription_count() for one in (
             self._publisher, *self._paths.created()))
         return self._period_s if observed else max(self._period_s, _UNOBSERVED_S)
-
-    def _show_paths(self, user: SceneUser, stamp: Time) -> None:
-        paths = user.estimated_path, user.true_path
-        # Without publishers, the zip is empty.
-        for publisher, places in zip(self._paths.publishers(user.user), paths, strict=False):
-            if places:
-                endpoints.publish_if_subscribed(
-                    (publisher,), functools.partial(path, places, stamp, self._frame))
 
     def _markers(self, stamp: Time) -> MarkerArray:
         state = self._scene

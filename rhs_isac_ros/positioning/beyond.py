@@ -112,15 +112,13 @@ def _times(one: _Factor, other: _Factor) -> _Factor:
 def _samples(mixture: Mixture) -> np.ndarray:
     """Return positions of each of C components, float64 [C, S, 3] [m]."""
     roots = np.linalg.cholesky(regular(mixture.covariances))
-    found: np.ndarray = mixture.means[:, None] + np.matmul(
+    return mixture.means[:, None] + np.matmul(
         standard_normal(_LIMITS.samples), np.swapaxes(roots, 1, 2))
-    return found
 
 
 def _is_outside(positions: np.ndarray, bounds_m: np.ndarray) -> np.ndarray:
     """Mark positions [..., 3] outside of a box, bool [...]."""
-    marked: np.ndarray = ((positions < bounds_m[0]) | (positions > bounds_m[1])).any(axis=-1)
-    return marked
+    return ((positions < bounds_m[0]) | (positions > bounds_m[1])).any(axis=-1)
 
 
 def _common_prior(sightings: Sequence[Sighting], positions: np.ndarray) -> np.ndarray:

@@ -57,9 +57,7 @@ class DispersedLikelihood(Conditional):
     def _covariances(self, of: Callable[[MeasurementModel], np.ndarray]) -> np.ndarray:
         """Return a covariance for each number of failures, [K, N_B, N_SB F, N_SB F]."""
         average, least = of(self._average), of(self._intact)
-        covariances: np.ndarray = (
-            least + self._scales[:, None, None, None] * (average - least))
-        return covariances
+        return least + self._scales[:, None, None, None] * (average - least)
 
     def states(self, of: Callable[[MeasurementModel], np.ndarray]) -> 'list[SurfaceState]':
         """Return the states of the surface with covariances `of` a model, for all positions."""

@@ -164,8 +164,7 @@ class Estimate:
         estimate. D = 6 with velocities. It is computed when it is first read. N estimates have a
         tuple of N.
         """
-        found: Mixture | None = self._computed('density')
-        return found
+        return self._computed('density')
 
     @property
     def sighting(self) -> Sighting | None:
@@ -174,8 +173,7 @@ class Estimate:
         Without a position, it is None, too, unless the reason is a user outside of the region,
         which is evidence. N estimates have a tuple of N.
         """
-        found: Sighting | None = self._computed('see')
-        return found
+        return self._computed('see')
 
     def _computed(self, name: str) -> Any:
         """Return the value of a field that may be a function, or N values."""

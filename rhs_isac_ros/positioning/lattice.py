@@ -272,8 +272,7 @@ class Expansion(NamedTuple):
         """Return means without their slow changes, at ranges [M], complex128 [M, N_B, N_SB F]."""
         range_m = range_m[:, None, None]
         factor = np.exp(-1j * self.wavenumbers * range_m) / range_m
-        template: np.ndarray = self.mean[index] * factor
-        return template
+        return self.mean[index] * factor
 
     def at(self, index: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Evaluate the mean signals at points [M, 3]; `index`, int [M], selects expansions.

@@ -361,5 +361,4 @@ def overlap(offsets: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, n
 def log_volume(covariances: np.ndarray) -> np.ndarray:
     """Return logarithms of integrals of Gaussians with the maximum 1, for [C, D, D], [C]."""
     size = covariances.shape[-1]
-    volume: np.ndarray = (size * np.log(2 * np.pi) + np.linalg.slogdet(covariances)[1]) / 2
-    return volume
+    return (size * np.log(2 * np.pi) + np.linalg.slogdet(covariances)[1]) / 2

@@ -89,8 +89,7 @@ def cells_of(bent: Sheets, grid: Grid, resolution: Resolution) -> np.ndarray:
     in_range = offsets_m <= reach[..., 0] + grid.widths_m / 2
     offsets = np.abs(grid.nodes[:, 1:] - merged.means[:, None, 1:])
     beside = (offsets <= reach[..., 1:] + PHASE_ERROR * resolution.direction).all(axis=2)
-    chosen: np.ndarray = (in_range[:, grid.range_bin] & beside[:, grid.node]).any(axis=0)
-    return chosen
+    return (in_range[:, grid.range_bin] & beside[:, grid.node]).any(axis=0)
 
 
 class Users(NamedTuple):
@@ -282,5 +281,4 @@ def constant_covariance(sheet: Sheets, shares: np.ndarray, pose: Pose) -> np.nda
     The result is float64 [3, 3] [m^2]; `shares` are those of `constant_shares`.
     """
     by_point = pose.rotation @ jacobian(sheet.means)[0] * np.sqrt(shares)
-    covariance: np.ndarray = by_point @ sheet.covariances[0] @ by_point.T
-    return covariance
+    return by_point @ sheet.covariances[0] @ by_point.T

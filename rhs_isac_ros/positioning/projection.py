@@ -92,9 +92,8 @@ class ProjectedModel(MeasurementModel):
         return project(self.basis, self.full.whiten(signals))
 
     def _whitened_terms(self, terms: np.ndarray) -> np.ndarray:
-        added: np.ndarray = terms.reshape(
+        return terms.reshape(
             *terms.shape[:-1], -1, self.whitener.shape[1]).sum(axis=-2)
-        return added
 
 
 def project(basis: np.ndarray, whitened: np.ndarray) -> np.ndarray:
@@ -182,6 +181,5 @@ def interpolation(scenario: Scenario, ends_m: np.ndarray | None = None,
         if np.abs(at_nodes @ weights - gains).max() <= max_error:
             break
     # The mean delay turns the gains from a node to a sub-band.
-    turned: np.ndarray = weights.T * np.exp(
+    return weights.T * np.exp(
         -1j * np.pi * delays.sum() * (offsets_hz[:, None] - nodes_hz))
-    return turned

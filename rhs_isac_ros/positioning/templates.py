@@ -261,8 +261,7 @@ class Query(NamedTuple):
 
         No position explains more than all of the energy; only approximations seem to.
         """
-        energies: np.ndarray = np.exp(-2 * gain) * self.energies[shots]
-        return energies
+        return np.exp(-2 * gain) * self.energies[shots]
 
 
 def turns_at(wavenumbers: np.ndarray, ranges_m: np.ndarray) -> np.ndarray:

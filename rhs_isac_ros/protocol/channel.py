@@ -242,7 +242,10 @@ class Channel(Role):
             case PatternsApplied():
                 self._resume(event)
             case FrontEndFailed():
-                self._fail(event)
+                del self._applying[event.key]
+                self._fault = event.text
+                self.counters[event.kind] += 1
+                self.log(event.text, warning=True, key=event.kind)
         if self._cycle and isinstance(event, m.Message):
             if isinstance(event, m.Beam | m.RhsConfiguration):
                 # Compute the capacity, which is the same in both directions, before data arrive.
@@ -354,12 +357,6 @@ class Channel(Role):
         elif impaired := self._delivery.send(
                 self._answer(exchange, applied.feeds), self._settings.in_use, self.now_s):
             self.counters[impaired] += 1
-
-    def _fail(self, failure: FrontEndFailed) -> None:
-        del self._applying[failure.key]
-        self._fault = failure.text
-        self.counters[failure.kind] += 1
-        self.log(failure.text, warning=True, key=failure.kind)
 
     def _answer(self, exchange: _Exchange, feeds: np.ndarray | None) -> m.Message:
         event, cycle = exchange.event, exchange.cycle

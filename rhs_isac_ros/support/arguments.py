@@ -33,8 +33,7 @@ class ArgumentParser(argparse.ArgumentParser):
                 word.encode()
             except UnicodeEncodeError:
                 self.error(f'argument {word!a}: expected UTF-8')
-        found: tuple[argparse.Namespace, list[str]] = super().parse_known_args(words, namespace)
-        return found
+        return super().parse_known_args(words, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Print an error as one line, and exit with code 2."""

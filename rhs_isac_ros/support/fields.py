@@ -124,8 +124,7 @@ class Field:
 
 def whole(name: str, value: Any, low: float = 0, high: float = math.inf) -> int:
     """Return an integer in a range; raise ValueError with `name` if it is not one."""
-    number: int = Field(int, low=low, high=high).checked(name, value)
-    return number
+    return Field(int, low=low, high=high).checked(name, value)
 
 
 def finite(name: str, value: Any, low: float = -math.inf) -> float:
@@ -133,5 +132,4 @@ def finite(name: str, value: Any, low: float = -math.inf) -> float:
     # At once, because roles check the time of every event.
     if type(value) is float and low <= value and abs(value) < math.inf:
         return value
-    number: float = Field(float, low=low).checked(name, value)
-    return number
+    return Field(float, low=low).checked(name, value)

@@ -55,8 +55,7 @@ class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[mi
                 raise ValueError(
                     f'{key}: repeated in line {one.start_mark.line + 1}, expected one value')
             known.add(key)
-        content: dict[Any, Any] = super().construct_mapping(node, deep)
-        return content
+        return super().construct_mapping(node, deep)
 
 
 for _tag, _pattern, _first in (
@@ -311,8 +310,7 @@ def _complex(array: np.ndarray) -> np.ndarray:
     """Return pairs of real and imaginary parts as complex numbers, and other arrays unchanged."""
     if array.dtype.names != ('real', 'imag'):
         return array
-    found: np.ndarray = array['real'] + 1j * array['imag']
-    return found
+    return array['real'] + 1j * array['imag']
 
 
 def read_archive(path: str | Path, kind: str, version: int, names: set[str]

@@ -60,8 +60,7 @@ class Worker:
         line = self._process.stdout.readline()
         if not line:
             sys.exit(f'{case}: the process of one revision has ended')
-        found: list[float] = json.loads(line)
-        return found
+        return json.loads(line)
 
     def close(self) -> None:
         """End the process."""

@@ -106,9 +106,8 @@ class Results:
 
     def errors_m2(self, condition: Condition, row: str) -> np.ndarray:
         """Return the squared errors, float64 [trials, N] [m^2]."""
-        errors: np.ndarray = np.sum(
+        return np.sum(
             (self.estimates[condition, row] - self.truth)**2, axis=-1)
-        return errors
 
     def best_estimates(self, condition: Condition, row: str) -> np.ndarray:
         """Return the estimates for panel (b), float64 [N, 3] [m]."""

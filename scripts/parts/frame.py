@@ -92,8 +92,7 @@ def imported(function: Callable[..., Any]) -> Callable[..., Any]:
         return function
     program = Path(str(sys.modules['__main__'].__file__))
     module = importlib.import_module(f'{program.parent.name}.{program.stem}')
-    found: Callable[..., Any] = getattr(module, function.__name__)
-    return found
+    return getattr(module, function.__name__)
 
 
 def experiment_options(

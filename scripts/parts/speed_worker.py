@@ -59,8 +59,7 @@ def signals(config: Path, case: str, n: int, rng: np.random.Generator) -> dict[s
     if case == FUSION:
         site = Site.from_yaml(config / 'site.yaml')
         low, high = site.bounds_m
-        received: dict[str, np.ndarray] = site.sample(low + (high - low) * rng.random((n, 3)), rng)
-        return received
+        return site.sample(low + (high - low) * rng.random((n, 3)), rng)
     scenario, codebook, known = system(config, case)
     positions = scenario.sample_positions(n, rng)
     if case == TRACK:
