@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import blocks, checked_states
+from rhs_isac_ros.model.arrays import blocks, checked_states, numbers
 from rhs_isac_ros.model.gaussian import Marginal, marginalise, quadratic_form
 from rhs_isac_ros.model.geometry import measurement_times_s, region_information, velocity_std_mps
 from rhs_isac_ros.model.impairments import nuisance_of
@@ -138,7 +138,8 @@ def site_information(surfaces: Iterable[MeasurementModel], positions: np.ndarray
     independent for each surface and cycle. Raises ValueError if a position is not in front of a
     surface.
     """
-    states, total = np.asarray(positions), np.zeros((len(positions), 6, 6))
+    states = numbers('positions', positions, shapes=[('N', 3), ('N', 6)])
+    total = np.zeros((len(states), 6, 6))
     # How position and velocity depend on the position and a velocity of unit variance.
     by_prior = np.eye(6)[:, :3]
     for number, model in enumerate(surfaces):

@@ -241,9 +241,10 @@ def capacity_report(
     passed to `choose_beam`. Raises ValueError if the position is not a finite [3] array, or the
     beam does not fit the scenario.
     """
+    position = checked_position(position)
+
     def actual_bps(beam: Beamformer) -> float:
-        place = np.asarray(position, dtype=float)[None]
-        return float(actual_capacity(scenario, applied_beam(beam, surface), place)[0])
+        return float(actual_capacity(scenario, applied_beam(beam, surface), position[None])[0])
 
     perfect = choose_beam(scenario, position, bands=bands, surface=surface)
     return CapacityReport(

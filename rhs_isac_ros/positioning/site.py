@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from rhs_isac_ros.model import Pose, Scenario
-from rhs_isac_ros.model.arrays import checked_bounds
+from rhs_isac_ros.model.arrays import checked_bounds, numbers
 from rhs_isac_ros.positioning.agreement import Pair, pair_agreements
 from rhs_isac_ros.positioning.estimate import (
     MISS_PROBABILITY,
@@ -20,6 +20,7 @@ from rhs_isac_ros.positioning.estimate import (
     Estimate,
     Sighting,
     SignalError,
+    checked_received,
 )
 from rhs_isac_ros.positioning.estimators import BayesEstimator
 from rhs_isac_ros.positioning.fusion import Fuser, fuse
@@ -112,7 +113,8 @@ class Site:
         With columns for the velocity, [N, 6], users move; velocities that the leader's scenario
         declares are drawn. Multipath, noise and impairments of different surfaces are independent.
         """
-        states, (_, speed_mps) = np.asarray(positions), self.users
+        states = numbers('positions', positions, shapes=[('N', 3), ('N', 6)])
+        _, speed_mps = self.users
         if speed_mps and states.shape[1:] == (3,):
             # All surfaces see the same velocity.
             states = np.hstack([states, speed_mps * (np.ptp(self.bounds_m, axis=0) > 0)
@@ -147,9 +149,10 @@ class SiteEstimator:
 
         `received` contains signals, complex128 [N_B, N_SB F], of some or all surfaces.
         """
-        ((_, found),) = self._each({
-            name: np.asarray(signals)[None] for name, signals in received.items()})
-        return found
+        found = [sightings for _, sightings in self._each(received)]
+        if len(found) != 1:
+            raise SignalError(f'received: {len(found)} shots, expected one')
+        return found[0]
 
     def _each(self, received: Mapping[str, np.ndarray]
               ) -> Iterator[tuple[dict[str, Estimate], dict[str, Sighting]]]:
@@ -157,7 +160,8 @@ class SiteEstimator:
         if not received or not received.keys() <= self._estimators.keys():
             raise SignalError(f'received: surfaces {sorted(received)}, expected some of '
                               f'{sorted(self._estimators)}')
-        found = {name: self._estimators[name].posterior(signals)
+        found = {name: self._estimators[name].posterior(
+            checked_received(self._site.surfaces[name].codebook, signals))
                  for name, signals in received.items()}
         lengths = {name: len(one.mean) for name, one in found.items()}
         if len(set(lengths.values())) > 1:
@@ -192,10 +196,8 @@ class SiteEstimator:
         `SignalError` if signals are unusable, there are none, a name is not that of a surface, or
         the numbers of shots differ.
         """
-        single = {name for name, signals in received.items() if np.ndim(signals) == 2}
-        found = [self._fused(*one) for one in self._each({
-            name: np.asarray(signals)[None] if name in single else signals
-            for name, signals in received.items()})]
+        found = [self._fused(*one) for one in self._each(received)]
+        single = any(np.ndim(signals) == 2 for signals in received.values())
         return found[0] if single else Estimate.of_each(found, SITE)
 
     def _fused(self, posteriors: Mapping[str, Estimate], sightings: Mapping[str, Sighting]

@@ -256,6 +256,8 @@ def test_information_adds_up_in_the_frame_of_the_site(model):
 def test_the_bound_takes_velocities_in_the_frame_of_the_site(model):
     states = np.hstack([PLACES, np.tile([3e4, 2e4, 1e4], (len(PLACES), 1))])
     own = np.hstack([SIDE.to_surface(PLACES), SIDE.vectors_to_surface(states[:, 3:])])
+    with pytest.raises(ValueError, match='positions: a masked array'):
+        site_crlb([at(model, SIDE)], np.ma.array(states))
     found = site_crlb([at(model, SIDE)], states)
     np.testing.assert_allclose(found, crlb_of(model, own))
     assert not np.allclose(found, crlb_of(model, own[:, :3]), rtol=1e-3)

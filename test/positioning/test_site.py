@@ -74,6 +74,17 @@ def test_several_shots_are_located_at_once(estimator, cycles):
         np.testing.assert_allclose(found[n].mixture.moments()[0], found.mean[n], rtol=1e-12)
     with pytest.raises(SignalError, match="'side': 1} shots, expected equal numbers"):
         estimator.estimate({**received, 'side': received['side'][:1]})
+    with pytest.raises(SignalError, match='received: 3 shots, expected one'):
+        estimator.sightings(received)
+
+
+def test_arrays_with_a_mask_are_refused(estimator, cycles):
+    hidden = {**cycles[1][0], 'side': np.ma.array(cycles[1][0]['side'])}
+    for answer in (estimator.estimate, estimator.sightings):
+        with pytest.raises(SignalError, match='received: a masked array'):
+            answer(hidden)
+    with pytest.raises(ValueError, match='positions: a masked array'):
+        SITE.sample(np.ma.array(cycles[0]), np.random.default_rng(0))
 
 
 @pytest.mark.slow
