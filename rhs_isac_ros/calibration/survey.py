@@ -36,16 +36,9 @@ from rhs_isac_ros.calibration.estimate import (
     residuals_of,
     weights_of,
 )
-from rhs_isac_ros.model import Beamforming, MeasurementModel, Scenario
+from rhs_isac_ros.model import Beamforming, MeasurementModel, Scenario, gaussian
 from rhs_isac_ros.model.arrays import adjoint
 from rhs_isac_ros.model.constants import POWER_NEPERS_PER_DB
-from rhs_isac_ros.model.gaussian import (
-    BLOCKED_STD_DB,
-    energy_limit,
-    log_evidence_of_level,
-    quadratic_form,
-    share_of_level,
-)
 from rhs_isac_ros.model.geometry import region_information
 from rhs_isac_ros.model.hall import CONDITIONS, FIELDS, MultipathEstimate
 from rhs_isac_ros.model.impairments import nuisance_of
@@ -116,7 +109,7 @@ def survey(scenario: Scenario, codebook: Beamforming, positions: np.ndarray,
     level_std_db = _level_std_db(energies, weights, n_measurements)
     # Estimators scale the covariance of a position by the level that the residual indicates.
     relative = energies / n_measurements
-    distances = distances / relative**share_of_level(n_measurements, level_std_db)
+    distances = distances / relative**gaussian.share_of_level(n_measurements, level_std_db)
     inflation = _inflation(distances, energies, weights, n_measurements)
     measured, declared = inflation * fit.covariance, model.covariance()
     inverse = np.linalg.inv(declared)
@@ -299,7 +292,7 @@ def _left_out(model: MeasurementModel, positions: np.ndarray, residuals: np.ndar
         energies[rows] = np.sum(np.abs(white)**2, axis=(1, 2))
         without[rows] = np.sum(np.abs(white + white_mean)**2, axis=(1, 2))
         flat = columns.reshape(*columns.shape[:2], -1)
-        covariance = np.linalg.inv(quadratic_form(flat) + prior)[:, :3, :3]
+        covariance = np.linalg.inv(gaussian.quadratic_form(flat) + prior)[:, :3, :3]
         gradient = 2 * np.einsum(
             'nar,nr->na', flat[:, :3].conj(), white.reshape(len(rows), -1)).real
         distances[rows] = np.einsum('na,nab,nb->n', gradient, covariance, gradient)
@@ -316,8 +309,8 @@ def _in_sight(fit: _Fit, without: np.ndarray) -> np.ndarray:
     level_std_db = _level_std_db(fit.energies[seen], fit.weights[seen], n_measurements)
     prior = min(fit.model.scenario.blocked_probability or _BLOCKED_PROBABILITY, _MAX_BLOCKED)
     log_odds = (np.log(1 / prior - 1)
-                + log_evidence_of_level(fit.energies, n_measurements, level_std_db)
-                - log_evidence_of_level(without, n_measurements, BLOCKED_STD_DB))
+                + gaussian.log_evidence_of_level(fit.energies, n_measurements, level_std_db)
+                - gaussian.log_evidence_of_level(without, n_measurements, gaussian.BLOCKED_STD_DB))
     return np.asarray(log_odds > 0)
 
 
@@ -326,7 +319,7 @@ def _inflation(distances: np.ndarray, energies: np.ndarray, weights: np.ndarray,
     """Return the inflation t, which is close to `_INFLATION` in small surveys."""
     most = max(1.0, float(np.average(energies, weights=weights)) / n_measurements,
                _quantile(distances, weights, COVERAGE) / _radius(),
-               _quantile(energies, weights, _PASSING) / energy_limit(n_measurements))
+               _quantile(energies, weights, _PASSING) / gaussian.energy_limit(n_measurements))
     shares = np.array([weights.sum(), _INFLATION_WEIGHT])
     return float(np.exp(shares @ np.log([most, _INFLATION]) / shares.sum()))
 

@@ -11,14 +11,7 @@ from typing import Any
 
 from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.calibration import Calibration
-from rhs_isac_ros.codebook import library_command
-from rhs_isac_ros.codebook.band_plan import (
-    DEFAULT_RASTER_HZ,
-    BandPlan,
-    Candidate,
-    best_of,
-    choose_bands,
-)
+from rhs_isac_ros.codebook import band_plan, library_command
 from rhs_isac_ros.codebook.codebook import Codebook
 from rhs_isac_ros.codebook.objective import OBJECTIVES, SAMPLINGS
 from rhs_isac_ros.codebook.optimize import (
@@ -116,7 +109,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add('--spectrum', type=interval, nargs='+', metavar='LOW:HIGH',
         help='choose the centre frequencies of the bands within these intervals [Hz]')
     add('--bands', type=positive_int, help='number of bands to choose')
-    add('--raster', type=positive_float, default=DEFAULT_RASTER_HZ,
+    add('--raster', type=positive_float, default=band_plan.DEFAULT_RASTER_HZ,
         help='spacing of possible centre frequencies [Hz]')
     add('--min-gap', type=positive_float,
         help='smallest distance between centre frequencies [Hz]; the width of a band if omitted')
@@ -208,17 +201,17 @@ def run(options: argparse.Namespace) -> tuple[Codebook, str]:
 
 def _choose_bands(
         options: argparse.Namespace, scenario: Scenario, given: Mapping[str, Any],
-        workers: Workers) -> BandPlan:
+        workers: Workers) -> band_plan.BandPlan:
     """Choose the bands and the codebook, and write the scenario with these bands."""
-    def report(candidate: Candidate) -> None:
+    def report(candidate: band_plan.Candidate) -> None:
         if not options.quiet:
             print(f'{_in_ghz(candidate.frequencies_hz)}: {candidate.error_m2:.4f} m^2 expected',
                   file=sys.stderr)
 
-    candidates = choose_bands(
+    candidates = band_plan.choose_bands(
         scenario, options.spectrum, options.bands, raster_hz=options.raster,
         min_gap_hz=options.min_gap, seed=options.seed, report=report, workers=workers)
-    best = best_of(scenario, candidates, given, options.seed, report, workers=workers)
+    best = band_plan.best_of(scenario, candidates, given, options.seed, report, workers=workers)
     best.scenario.to_yaml(options.plan, 'Chosen by python3 -m rhs_isac_ros.codebook --spectrum. '
                           'Omitted fields have the values of Table I.')
     print(f'{options.plan}: {_in_ghz(best.scenario.center_frequencies_hz)}, '

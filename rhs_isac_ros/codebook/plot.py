@@ -11,15 +11,7 @@ from rhs_isac_ros.codebook.problem import Progress
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.surface import radiation_matrix
-from rhs_isac_ros.support.pictures import (
-    LOOKS,
-    PAGE_IN,
-    add_panels,
-    label_decades,
-    look,
-    new_figure,
-    paper_style,
-)
+from rhs_isac_ros.support import pictures
 
 # Number of points along each axis of the map of the bound, and number of azimuths of a beam.
 _N_MAP_POINTS = 60
@@ -28,7 +20,7 @@ _N_AZIMUTHS = 361
 _N_COLUMNS = 3
 
 
-@paper_style('plotting')
+@pictures.paper_style('plotting')
 def plot_optimization(
         scenario: Scenario, codebook: Codebook, history: Sequence[Progress]) -> Any:
     """Plot convergence, the bound over the region of interest, and the beam patterns.
@@ -37,12 +29,12 @@ def plot_optimization(
     """
     rows = -(-scenario.n_bands // _N_COLUMNS)
     heights_in = 2.7, 2.3 * rows
-    figure = new_figure(PAGE_IN, sum(heights_in))
+    figure = pictures.new_figure(pictures.PAGE_IN, sum(heights_in))
     above, below = figure.add_gridspec(2, 1, height_ratios=heights_in)
     left, right = above.subgridspec(1, 2).subplots()
     _draw_convergence(left, history)
     _draw_bound(right, scenario, codebook)
-    axes, legend = add_panels(
+    axes, legend = pictures.add_panels(
         below, rows, min(scenario.n_bands, _N_COLUMNS), sharex=True, sharey=True)
     for axis in axes.flat[scenario.n_bands:]:
         axis.set_visible(False)
@@ -50,7 +42,7 @@ def plot_optimization(
         _draw_beams(axis, scenario, codebook, band)
     for axis in axes[:, 0]:
         axis.set_ylabel('relative power [dB]')
-    if scenario.n_frames <= len(LOOKS):
+    if scenario.n_frames <= len(pictures.LOOKS):
         legend.legend(*axes[0, 0].get_legend_handles_labels(), loc='lower center', ncols=4)
     return figure
 
@@ -76,9 +68,9 @@ def beam_powers(
 
 def _draw_convergence(axis: Any, history: Sequence[Progress]) -> None:
     axis.semilogy([entry.step for entry in history], [entry.value_m2 for entry in history],
-                  color=look(0).colour)
+                  color=pictures.look(0).colour)
     axis.set(xlabel='step', ylabel='objective [m$^2$]', title='convergence')
-    label_decades(axis.yaxis)
+    pictures.label_decades(axis.yaxis)
     axis.grid()
 
 
@@ -97,7 +89,7 @@ def _draw_beams(axis: Any, scenario: Scenario, codebook: Codebook, band: int) ->
     azimuths, powers = beam_powers(scenario, codebook, band)
     for frame, power in enumerate(powers):
         decibels = 10 * np.log10(np.maximum(power / powers.max(), 1e-3))
-        own = look(frame)
+        own = pictures.look(frame)
         axis.plot(np.degrees(azimuths), decibels, color=own.colour, linestyle=own.line,
                   label=f'frame {frame}')
     axis.set(xlabel='azimuth [°]', xlim=(-90, 90), ylim=(-30, 1),

@@ -10,16 +10,7 @@ from rhs_isac_ros.experiments.sweep import Point
 from rhs_isac_ros.experiments.sweep_settings import FIELDS, MEASURES, Axis, plain
 from rhs_isac_ros.model.board import Board
 from rhs_isac_ros.model.external import External
-from rhs_isac_ros.support.pictures import (
-    COLUMN_IN,
-    LOOKS,
-    PAGE_IN,
-    Look,
-    label_decades,
-    look,
-    new_panels,
-    paper_style,
-)
+from rhs_isac_ros.support import pictures
 
 # Heights of a row of panels, of the legend, and of an additional line of labels.
 _PANEL_IN, _LEGEND_IN, _LINE_IN = 2.2, 0.4, 0.13
@@ -40,12 +31,12 @@ class _Line(NamedTuple):
 
     points: Sequence[Point]
     label: str
-    look: Look
+    look: pictures.Look
     fill: str
     shift: float
 
 
-@paper_style('drawing the sweep')
+@pictures.paper_style('drawing the sweep')
 def draw(axes: Sequence[Axis], points: Sequence[Point],
          panels: Sequence[Sequence[str]]) -> Any:
     """Draw points, and return the `matplotlib.figure.Figure`.
@@ -58,8 +49,8 @@ def draw(axes: Sequence[Axis], points: Sequence[Point],
     combinations = list(dict.fromkeys(_key(point, rows) for point in points))
     joined = [names for names in panels if len(names) > 1]
     n_lines = max(_text(first, values[0]).count(', ') for values in first.values)
-    figure, grid, above = new_panels(
-        COLUMN_IN if len(panels) == 1 else PAGE_IN * max(len(panels) / 3, 1),
+    figure, grid, above = pictures.new_panels(
+        pictures.COLUMN_IN if len(panels) == 1 else pictures.PAGE_IN * max(len(panels) / 3, 1),
         _PANEL_IN * len(combinations) + _LEGEND_IN * bool(lines or joined) + _LINE_IN * n_lines,
         len(combinations), len(panels), sharex=True)
     for panel, top in zip(grid[1:].flat, np.tile(grid[0], len(combinations) - 1), strict=True):
@@ -100,7 +91,7 @@ def draw_panel(panel: Any, first: Axis, others: Sequence[Axis], points: Sequence
         _draw_line(panel, _shifted(panel, places, line.shift)[ranks], factor
                    * np.array([point.interval for point in own]).reshape(-1, 3), line)
     if logarithmic and max(finite) < _FEW_DECADES * min(finite):
-        label_decades(panel.yaxis)
+        pictures.label_decades(panel.yaxis)
     if not numeric or len(values) <= _MAX_TICKS:
         # Lists of numbers would not fit side by side.
         panel.set_xticks(places, [_text(first, value).replace(', ', '\n') for value in values])
@@ -125,7 +116,7 @@ def add_legend(place: Any, panels: Sequence[Any], lines: Sequence[Axis],
         for names in joined:
             found |= _styles(names)
     title = ''.join(f'{_label(axis)}; ' for axis in lines)
-    wide = place.figure.get_figwidth() > COLUMN_IN
+    wide = place.figure.get_figwidth() > pictures.COLUMN_IN
     place.legend(found.values(), found, loc='lower center', ncols=4 if wide else 2,
                  title=f'{title}bars: 95 % intervals')
 
@@ -187,9 +178,9 @@ def _lines(others: Sequence[Axis], points: Sequence[Point], names: Sequence[str]
         for number, name in enumerate(names):
             own = [point for point in points
                    if _key(point, others) == key and point.measure == name]
-            style = look(rank if others else number)
+            style = pictures.look(rank if others else number)
             if len(names) > 1:
-                style = style._replace(line=LOOKS[number].line)
+                style = style._replace(line=pictures.LOOKS[number].line)
             label = ', '.join(map(_text, others, key)) if others else MEASURES[name].label
             place = rank * len(names) + number - (len(keys) * len(names) - 1) / 2
             lines.append(_Line(own, label, style, 'white' if number else style.colour,
@@ -225,7 +216,7 @@ def _styles(names: Sequence[str]) -> dict[str, Any]:
     from matplotlib.lines import Line2D
     handles = {}
     for number, name in enumerate(names):
-        style: Any = LOOKS[number].line
+        style: Any = pictures.LOOKS[number].line
         handles[MEASURES[name].label] = Line2D(
             [], [], color='0.4', linestyle=style, marker='o',
             markerfacecolor='white' if number else '0.4')

@@ -16,17 +16,11 @@ import functools
 
 import numpy as np
 
+from rhs_isac_ros.model import multipath
 from rhs_isac_ros.model.arrays import adjoint, blocks, gauss_legendre, read_only
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.elements import has_errors
 from rhs_isac_ros.model.geometry import frame_lags_s, polar_bounds
-from rhs_isac_ros.model.multipath import (
-    complex_normal,
-    declared_covariance,
-    frequency_correlation,
-    square_root,
-    time_correlation,
-)
 from rhs_isac_ros.model.scenario import Scenario
 
 # Number of functions of the sub-bands, and further ones per turn of the phase over the band that
@@ -98,7 +92,8 @@ def combined_covariance(scenario: Scenario, radiation: np.ndarray, functions: np
 
     n_functions = functions.shape[1]
     # The first column and the first row of K_f.
-    column = frequency_correlation(scenario, np.arange(len(functions)) * scenario.spacing_hz)
+    column = multipath.frequency_correlation(
+        scenario, np.arange(len(functions)) * scenario.spacing_hz)
     covariance = []
     for band, one in enumerate(radiation):
         over, frames = _terms(scenario, one)
@@ -122,7 +117,7 @@ def scattered_parts(scenario: Scenario, radiation: np.ndarray) -> list[np.ndarra
     parts = []
     for band, one in enumerate(radiation):
         over, frames = _terms(scenario, one)
-        root = square_root(_correlated(scenario, band, frames))
+        root = multipath.square_root(_correlated(scenario, band, frames))
         power = np.sum(np.abs(root)**2, axis=0)
         root = root[:, power > _DRAWN * power.max()]
         parts.append(np.tensordot(over, root.reshape(*frames.shape[:2], -1), axes=1))
@@ -136,7 +131,7 @@ def draw_scattered(scenario: Scenario, parts: np.ndarray, n: int, rng: np.random
     drawn = np.empty((n, *parts.shape[:2]), complex)
     for block in blocks(n, max(_BLOCK_NUMBERS // (factor.shape[1] * parts.shape[2]), 1)):
         shape = factor.shape[1], parts.shape[2], len(drawn[block])
-        white = complex_normal(shape, rng).reshape(shape[0], -1)
+        white = multipath.complex_normal(shape, rng).reshape(shape[0], -1)
         gains = (factor @ white).reshape(-1, *shape[1:])
         drawn[block] = np.moveaxis(np.matmul(parts, gains), 2, 0)
     return drawn.reshape(n, -1)
@@ -155,8 +150,8 @@ def _correlated(scenario: Scenario, band: int, frames: np.ndarray) -> np.ndarray
     """Compute the covariance of multipath in frames [L, F, N_E], [L F, L F], without K_f."""
     rows = frames.reshape(-1, scenario.n_elements)
     lags_s = frame_lags_s(scenario)
-    over_time = time_correlation(scenario, np.abs(lags_s[:, None] - lags_s))[band]
-    spatial = declared_covariance(scenario)[band].scatter(rows) @ adjoint(rows)
+    over_time = multipath.time_correlation(scenario, np.abs(lags_s[:, None] - lags_s))[band]
+    spatial = multipath.declared_covariance(scenario)[band].scatter(rows) @ adjoint(rows)
     return np.tile(over_time, (len(frames), len(frames))) * spatial
 
 

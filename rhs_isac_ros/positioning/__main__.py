@@ -6,13 +6,7 @@ from collections.abc import Sequence
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.positioning.neural import (
-    DEFAULT_EPOCHS,
-    DEFAULT_HIDDEN,
-    DEFAULT_PAIRS,
-    INPUTS,
-    train,
-)
+from rhs_isac_ros.positioning import neural
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
     check_distinct,
@@ -37,13 +31,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add('--codebook', type=input_file, required=True, help='codebook file')
     add('--scenario', '--config', type=input_file,
         help="YAML file of the scenario; the paper's Table I if omitted")
-    add('--pairs', type=integer(20, 10**7), default=DEFAULT_PAIRS,
+    add('--pairs', type=integer(20, 10**7), default=neural.DEFAULT_PAIRS,
         help='simulated pairs for training, validation and test, 7 : 1.5 : 1.5')
-    add('--inputs', choices=sorted(INPUTS), default='parts',
+    add('--inputs', choices=sorted(neural.INPUTS), default='parts',
         help='real and imaginary parts of the signals, or their magnitudes')
-    add('--hidden', type=integer(1, 10**5), default=DEFAULT_HIDDEN,
+    add('--hidden', type=integer(1, 10**5), default=neural.DEFAULT_HIDDEN,
         help='units of the hidden layer')
-    add('--epochs', type=positive_int, default=DEFAULT_EPOCHS,
+    add('--epochs', type=positive_int, default=neural.DEFAULT_EPOCHS,
         help='maximum number of passes through the pairs')
     add('--seed', type=seed, default=0,
         help='seed of the pairs, the initial weights and the order of the pairs')
@@ -62,7 +56,7 @@ def _run(options: argparse.Namespace) -> None:
     scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
     codebook = Codebook.load(options.codebook, scenario)
     with progress_bar(options.epochs, 'epoch', quiet=options.quiet) as show:
-        network = train(
+        network = neural.train(
             scenario, codebook, options.pairs, options.seed, options.hidden, options.epochs,
             show and (lambda epoch, mse_m2: show(epoch, f'{mse_m2:.3f} m^2')),
             options.inputs)

@@ -23,13 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.gaussian import (
-    BLOCKED_STD_DB,
-    FALSE_ALARM,
-    energy_limit,
-    log_evidence_of_level,
-    share_of_level,
-)
+from rhs_isac_ros.model import gaussian
 from rhs_isac_ros.positioning.alternatives import ALTERNATIVES, probabilities_of
 from rhs_isac_ros.positioning.estimate import Estimate
 
@@ -79,12 +73,12 @@ class FitTest:
     def __init__(self, n_measurements: int, level: float = 1.0, board: str = '') -> None:
         from scipy.special import gammaincinv
 
-        self.min_energy = float(gammaincinv(n_measurements, FALSE_ALARM))
+        self.min_energy = float(gammaincinv(n_measurements, gaussian.FALSE_ALARM))
         self._level = level
         # If the level of the multipath is unknown, the ratio of the likelihoods with and without a
         # direct path is (energy / residual)**n.
-        self._weak_share = FALSE_ALARM**(1 / n_measurements)
-        self.max_residual = energy_limit(n_measurements)
+        self._weak_share = gaussian.FALSE_ALARM**(1 / n_measurements)
+        self.max_residual = gaussian.energy_limit(n_measurements)
         self._hint = f'; the surface may have another board than {board!r}' if board else ''
 
     def min_energy_test(self, energy: float) -> str:
@@ -123,7 +117,8 @@ def misfit_log_ratio(residual: float, n: int) -> float:
 
     It is relative to the best position. The residual then has an unknown level.
     """
-    return float(log_evidence_of_level(np.array([residual]), n, BLOCKED_STD_DB)[0]) + residual
+    (evidence,) = gaussian.log_evidence_of_level(np.array([residual]), n, gaussian.BLOCKED_STD_DB)
+    return float(evidence) + residual
 
 
 class InnovationTest:
@@ -211,7 +206,7 @@ def _terms(energy: float, expected: float, level_std_db: float) -> tuple[_Sum, _
     causes the common parts.
     """
     scale = max(expected, 1.0)
-    share = share_of_level(scale, level_std_db)
+    share = gaussian.share_of_level(scale, level_std_db)
     shape = scale * (1 - share)
     std = scale / shape**0.5
     deviation = min(max((energy - expected) / std, -_LIMITS.deviation), _LIMITS.deviation)
@@ -287,6 +282,6 @@ def _cause(estimates: Collection[Estimate], subject: str, deviates: bool,
         return subject
     # The energy of n complex measurements has the relative variance 1 / n; levels add to it.
     n = float(np.mean(expected))
-    shape = n * (1 - share_of_level(n, level_std_db))
+    shape = n * (1 - gaussian.share_of_level(n, level_std_db))
     dispersion = float(shape * np.var(np.log(residual / expected)))
     return LEVEL if dispersion <= _MAX_DISPERSION else SPREAD

@@ -21,15 +21,8 @@ from rhs_isac_ros.model.impairments import draw_factors
 from rhs_isac_ros.model.los import direct_gain, draw_blocked
 from rhs_isac_ros.model.multipath import draw_multipath, time_correlation
 from rhs_isac_ros.model.surface import NOMINAL, Response, element_signals, feed_signals
+from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import (
-    ApplyPatterns,
-    Event,
-    FrontEndFailed,
-    Outcome,
-    PatternsApplied,
-    SettingsOffered,
-)
 from rhs_isac_ros.protocol.role import REMEMBERED_CYCLES, NewestDict, Role
 from rhs_isac_ros.protocol.settings import Impairments, PendingSettings
 from rhs_isac_ros.support import streams
@@ -149,7 +142,8 @@ class _Exchange:
 
 
 def apply_patterns(
-        front_end: FrontEnd, request: ApplyPatterns) -> PatternsApplied | FrontEndFailed:
+        front_end: FrontEnd, request: events.ApplyPatterns
+) -> events.PatternsApplied | events.FrontEndFailed:
     """Show and measure configurations one after the other, until one fails."""
     feeds = None
     try:
@@ -158,14 +152,14 @@ def apply_patterns(
         else:
             front_end.show(request.configurations)
     except SurfaceFault as fault:
-        return FrontEndFailed(request.key, f'surface_{fault.kind}', f'surface: {fault}')
+        return events.FrontEndFailed(request.key, f'surface_{fault.kind}', f'surface: {fault}')
     except RadioFault as fault:
-        return FrontEndFailed(request.key, 'radio', f'radio: {fault}')
+        return events.FrontEndFailed(request.key, 'radio', f'radio: {fault}')
     # The surface cannot show such a configuration, or a driver of another package fails.
     except Exception as error:
         kind = type(error).__name__
-        return FrontEndFailed(request.key, f'surface_{kind}', f'surface: {kind}: {error}')
-    return PatternsApplied(request.key, feeds)
+        return events.FrontEndFailed(request.key, f'surface_{kind}', f'surface: {kind}: {error}')
+    return events.PatternsApplied(request.key, feeds)
 
 
 class Channel(Role):
@@ -224,24 +218,24 @@ class Channel(Role):
         warning = {'warning.front_end': self._fault} if self._fault else {}
         return self._settings.describe() | warning
 
-    def react(self, event: Event) -> None:
+    def react(self, event: events.Event) -> None:
         """Process an event, then send the signals and data whose delay has passed."""
         match event:
-            case SettingsOffered(settings):
+            case events.SettingsOffered(settings):
                 self._settings.latest = settings
             case m.GroundTruth() if event.cycle_id:
                 self._begin(event)
             case m.RhsConfiguration():
-                self.count(Outcome.OVERFLOW, self._configurations.put(
+                self.count(events.Outcome.OVERFLOW, self._configurations.put(
                     (event.cycle_id, event.mode, event.band), event.analog))
             case m.Beam():
                 self._keep_beam(event)
             case m.Pilot() | m.Data(stage=m.Stage.OFFERED):
-                self.count(Outcome.OVERFLOW, self._pending.put(
+                self.count(events.Outcome.OVERFLOW, self._pending.put(
                     (event.cycle_id, next(self._serial)), event))
-            case PatternsApplied():
+            case events.PatternsApplied():
                 self._resume(event)
-            case FrontEndFailed():
+            case events.FrontEndFailed():
                 del self._applying[event.key]
                 self._fault = event.text
                 self.counters[event.kind] += 1
@@ -259,15 +253,15 @@ class Channel(Role):
         key = beam.cycle_id, beam.user
         known = self._beams.get(key)
         if known and not m.same_instance(known.sender, beam.sender):
-            self.count(Outcome.WRONG_INSTANCE)
+            self.count(events.Outcome.WRONG_INSTANCE)
         else:
-            self.count(Outcome.OVERFLOW, self._beams.put(key, beam))
+            self.count(events.Outcome.OVERFLOW, self._beams.put(key, beam))
 
     def _begin(self, truth: m.GroundTruth) -> None:
         # A restarted base station may repeat a cycle id, with the user at another position.
         key = truth.cycle_id, truth.user, truth.sender, *truth.position.tolist()
         if key in self._begun:
-            self.count(Outcome.DUPLICATE)
+            self.count(events.Outcome.DUPLICATE)
             return
         self._begun.put(key, None)
         if changes := self._settings.apply():
@@ -278,13 +272,13 @@ class Channel(Role):
             truth.velocity)
         if position[0, 0] + min(shifts[..., 0].min(), 0.0) <= 0:
             # Another surface of the site may have the user in sight.
-            self.count(Outcome.BEHIND)
+            self.count(events.Outcome.BEHIND)
             return
         multipath = self._fading.gains(
             truth.user, truth.cycle_id, truth.time_s(self.now_s),
             memory=self._settings.in_use.multipath_memory)
         self._cycle = self._draw(truth, position, shifts, multipath)
-        self.count(Outcome.STALE, sum(key[0] != truth.cycle_id for key in self._pending))
+        self.count(events.Outcome.STALE, sum(key[0] != truth.cycle_id for key in self._pending))
         stores: tuple[NewestDict[Any, Any], ...] = (
             self._pending, self._configurations, self._beams)
         for store in stores:
@@ -317,14 +311,14 @@ class Channel(Role):
             if event.cycle_id != cycle.truth.cycle_id:
                 continue
             if event.user != cycle.truth.user:
-                self.count(Outcome.WRONG_USER)
+                self.count(events.Outcome.WRONG_USER)
             elif _is_from_other_instance(event, cycle.truth):
-                self.count(Outcome.WRONG_INSTANCE)
+                self.count(events.Outcome.WRONG_INSTANCE)
             elif any(exchange.covers(event, cycle) for exchange in self._applying.values()):
-                self.count(Outcome.DUPLICATE)
+                self.count(events.Outcome.DUPLICATE)
             elif (configurations := self._configurations_for(event, cycle)) is not None:
                 self._applying[key] = _Exchange(event, cycle, configurations)
-                self.act(ApplyPatterns(
+                self.act(events.ApplyPatterns(
                     key, configurations, self._sounding(event, cycle, configurations)))
             else:
                 continue
@@ -346,14 +340,14 @@ class Channel(Role):
         shown = self._configurations.get((beam.cycle_id, m.Mode.TRANSMISSION, beam.band))
         return None if shown is None else (beam, shown)
 
-    def _resume(self, applied: PatternsApplied) -> None:
+    def _resume(self, applied: events.PatternsApplied) -> None:
         """Answer a message whose configurations were shown, unless its cycle is over."""
         if self._fault:
             self._fault = ''
             self.log_state('front end', 'surface and radio work again', False)
         exchange = self._applying.pop(applied.key)
         if exchange.cycle is not self._cycle:
-            self.count(Outcome.STALE)
+            self.count(events.Outcome.STALE)
         elif impaired := self._delivery.send(
                 self._answer(exchange, applied.feeds), self._settings.in_use, self.now_s):
             self.counters[impaired] += 1

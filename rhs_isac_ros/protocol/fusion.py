@@ -17,14 +17,8 @@ from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.positioning.site import Site
 from rhs_isac_ros.positioning.tracking import MixtureTracker, Motion
+from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import (
-    AgreementsDrawn,
-    Event,
-    Outcome,
-    PublishTrack,
-    SettingsOffered,
-)
 from rhs_isac_ros.protocol.role import NewestDict, Role
 from rhs_isac_ros.protocol.settings import FusionSettings, PendingSettings
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
@@ -156,13 +150,13 @@ class Fusion(Role):
             if self._is_silent(name)} | (
             {'warning.poses': _wrong_poses(self._suspects)} if self._suspects else {})
 
-    def react(self, event: Event) -> None:
+    def react(self, event: events.Event) -> None:
         """Process an event, then locate the users of the cycles that are complete or due."""
         match event:
-            case SettingsOffered(settings):
+            case events.SettingsOffered(settings):
                 self._settings.latest = settings
                 self.log(self._settings.apply())
-            case AgreementsDrawn(references, places) if references:
+            case events.AgreementsDrawn(references, places) if references:
                 self._test = PoseTest(references, places)
             case m.Posterior() | m.NoFix():
                 self._receive(event)
@@ -180,7 +174,7 @@ class Fusion(Role):
     def _receive(self, message: m.Posterior | m.NoFix) -> None:
         name, key = self._names.get(message.scenario_id), (message.cycle_id, message.user)
         if name is None:
-            self.count(Outcome.WRONG_SCENARIO)
+            self.count(events.Outcome.WRONG_SCENARIO)
             return
         if self._is_silent(name):
             self.log_state(f'surface {name}', f'surface {name} answers again', False)
@@ -195,12 +189,12 @@ class Fusion(Role):
                 self.log(f'wait_s: {wait_s:g} s, expected less than step_timeout_s of the base '
                          'station, which began another cycle meanwhile', warning=True,
                          key='wait_s')
-            self.count(Outcome.OVERFLOW, self._open.put(
+            self.count(events.Outcome.OVERFLOW, self._open.put(
                 key, _Fix(self.now_s + wait_s, {name: message})))
         elif isinstance(before := fix.answers.get(name), m.Posterior) or type(before) is type(
                 message):
             # A posterior that is no position comes with its reason, in any order.
-            self.count(Outcome.DUPLICATE, not _is_followed(message))
+            self.count(events.Outcome.DUPLICATE, not _is_followed(message))
         else:
             fix.answers[name] = message
 
@@ -211,7 +205,7 @@ class Fusion(Role):
     def _answer_again(
             self, name: str, answered: Collection[str], answer: m.Message | None) -> None:
         """Repeat an answer, which may have been lost, if a surface repeats its own."""
-        self.count(Outcome.DUPLICATE if name in answered else Outcome.STALE)
+        self.count(events.Outcome.DUPLICATE if name in answered else events.Outcome.STALE)
         if answer and name in answered:
             self.send(answer)
 
@@ -293,11 +287,11 @@ class Fusion(Role):
         self._tracks.put(source.user, (source.user_instance, tracker))
         estimate = tracker.update(source.time_s(self.now_s), mixture, missing)
         if estimate:
-            self.act(PublishTrack(source.user, estimate, source.stamp_ns))
+            self.act(events.PublishTrack(source.user, estimate, source.stamp_ns))
 
     def _no_fix(self, fix: _Fix, reason: str = '') -> None:
         source = next(iter(fix.answers.values()))
-        self.count(Outcome.NO_FIX)
+        self.count(events.Outcome.NO_FIX)
         reason = reason or '; '.join(f'{name}: {answer.reason}' for name, answer in sorted(
             fix.answers.items()) if isinstance(answer, m.NoFix))
         self._answer(fix, m.derive(m.NoFix, source, stamp_ns=source.stamp_ns, codebook_id='',

@@ -28,15 +28,7 @@ from rclpy.utilities import ok, remove_ros_args, try_shutdown
 
 from rhs_isac_ros.codebook import CodebookError
 from rhs_isac_ros.model import ScenarioError
-from rhs_isac_ros.ros import parameters
-from rhs_isac_ros.ros.environment import (
-    SECURITY,
-    STRATEGY,
-    check_environment,
-    is_secure,
-    log_arguments,
-    use_discovery_profile,
-)
+from rhs_isac_ros.ros import environment, parameters
 from rhs_isac_ros.support.exits import exit_code_of, on_end_signals
 from rhs_isac_ros.support.fields import ParameterError
 
@@ -49,7 +41,7 @@ _MEANINGS = {
     'failed to create participant': 'Fast DDS rejects the files of the enclave, which may be '
     'damaged, expired, or signed by another authority or for another ROS_DOMAIN_ID',
     'security libraries': 'Fast DDS was built without security, as in the wheels; install the '
-    f'packages of ROS 2 Jazzy, or unset {SECURITY}',
+    f'packages of ROS 2 Jazzy, or unset {environment.SECURITY}',
     'error not set': 'ROS_SECURITY_KEYSTORE: empty, expected a keystore'}
 # Maximum time to destroy the nodes [s]. Fast DDS 2.14 can deadlock if a publisher is destroyed
 # while another participant times out.
@@ -108,8 +100,8 @@ def init(args: Sequence[str]) -> None:
     invalidate the context while a callback publishes.
     """
     with starting():
-        use_discovery_profile()
-        rclpy.init(args=[*args, *_enclave(args), *log_arguments()],
+        environment.use_discovery_profile()
+        rclpy.init(args=[*args, *_enclave(args), *environment.log_arguments()],
                    signal_handler_options=SignalHandlerOptions.NO)
 
 
@@ -118,7 +110,7 @@ def _enclave(args: Sequence[str]) -> list[str]:
 
     Nodes and ``replay`` have their full names as enclaves; all other tools have ``operator``.
     """
-    if not is_secure() or '--enclave' in args:
+    if not environment.is_secure() or '--enclave' in args:
         return []
     rules = {match[1]: match[2] for match in map(_RULE.fullmatch, args) if match}
     program = os.path.basename(args[0])
@@ -126,9 +118,9 @@ def _enclave(args: Sequence[str]) -> list[str]:
     enclave = f'{rules.get("ns", "").rstrip("/")}/' + (
         rules.get('node', rules.get('name', program)) if is_own else 'operator')
     folder = Path(os.environ.get('ROS_SECURITY_KEYSTORE', ''), 'enclaves', enclave.lstrip('/'))
-    if os.environ.get(STRATEGY) != 'Enforce' and not folder.is_dir():
-        print(f'WITHOUT security: {STRATEGY} is not Enforce, and there is no folder {folder}',
-              file=sys.stderr)
+    if os.environ.get(environment.STRATEGY) != 'Enforce' and not folder.is_dir():
+        print(f'WITHOUT security: {environment.STRATEGY} is not Enforce, and there is no folder '
+              f'{folder}', file=sys.stderr)
     return ['--ros-args', '--enclave', enclave]
 
 
@@ -137,7 +129,7 @@ def parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse
 
     If an argument or an environment variable of ROS is invalid, exit with a usage error.
     """
-    check_environment(parser)
+    environment.check_environment(parser)
     try:
         with starting():
             words = remove_ros_args([parser.prog, *arguments])[1:]

@@ -40,17 +40,7 @@ from rhs_isac_ros.ros.processes import Processes
 from rhs_isac_ros.ros.recording import Recorder
 from rhs_isac_ros.ros.roster import MAX_USER_NODES, nodes_of
 from rhs_isac_ros.ros.run import StartError, init, starting
-from rhs_isac_ros.support import plugins
-from rhs_isac_ros.support.arguments import (
-    ArgumentParser,
-    input_file,
-    integer,
-    output_file,
-    parse_options,
-    picture_file,
-    positive_int,
-    seed,
-)
+from rhs_isac_ros.support import arguments, plugins
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.exits import on_end_signals, print_error
 from rhs_isac_ros.support.pictures import write_picture
@@ -78,10 +68,11 @@ _FUSED = 'fused'
 
 def add_network_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for the seed and the files of a network."""
-    parser.add_argument('--seed', type=seed, default=0, help='seed of all random numbers')
-    parser.add_argument('--config', '--scenario', type=input_file, metavar='FILE',
+    parser.add_argument('--seed', type=arguments.seed, default=0,
+                        help='seed of all random numbers')
+    parser.add_argument('--config', '--scenario', type=arguments.input_file, metavar='FILE',
                         help="scenario file; by default the paper's Table I")
-    parser.add_argument('--codebook', type=input_file, metavar='FILE',
+    parser.add_argument('--codebook', type=arguments.input_file, metavar='FILE',
                         help='codebook file; by default codebook_NAME beside the scenario file '
                              'NAME, or else the codebook of the package')
 
@@ -316,7 +307,7 @@ def _check_front_end(options: argparse.Namespace, scenario: Scenario) -> None:
         make_surface(options.surface, scenario.n_elements, **port).close()
     with translated(causes, StartError, 'argument --radio'):
         radio = make_radio(options.radio, scenario, Air(scenario, np.random.default_rng(0)),
-                           **parse_options(options.radio_options or ''))
+                           **arguments.parse_options(options.radio_options or ''))
     radio.close()
     if options.samples and not isinstance(radio.modem, Waveform):
         raise StartError(f'argument --samples: the radio {options.radio} has no samples')
@@ -473,19 +464,19 @@ def _report(
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = ArgumentParser(
+    parser = arguments.ArgumentParser(
         prog='demo', description='Start a network, every node as a process, and report on its '
         'cycles.', formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     add = parser.add_argument
-    add('--users', type=integer(1, MAX_USERS), default=2, help='number of users')
-    add('--cycles', type=positive_int, default=20, help='cycles to wait for')
+    add('--users', type=arguments.integer(1, MAX_USERS), default=2, help='number of users')
+    add('--cycles', type=arguments.positive_int, default=20, help='cycles to wait for')
     add_network_options(parser)
     add_files(parser, 'calibration', 'system')
     add('--surface', metavar='NAME', default='emulated',
         help=f'surface that shows the configurations: {", ".join(SURFACES)}, or a plug-in')
     add('--port', metavar='PORT',
         help='port of the surface, or emulated: an emulated board Open Source RIS')
-    add('--site', type=input_file, metavar='FILE',
+    add('--site', type=arguments.input_file, metavar='FILE',
         help='site file, instead of --config and --codebook')
     add('--radio', metavar='NAME', default='emulated',
         help=f'radio that measures the pilots: {", ".join(RADIOS)}, or a plug-in')
@@ -494,11 +485,11 @@ def _parser() -> argparse.ArgumentParser:
         help='folder in which the samples of the radio are recorded (SigMF)')
     add('--prior', choices=PRIORS, default=REGION,
         help='prior of the positions: the region, or the track of each user')
-    add('--follow', nargs='?', type=input_file, const=True, metavar='LIBRARY',
+    add('--follow', nargs='?', type=arguments.input_file, const=True, metavar='LIBRARY',
         help='follow the tracks of walking users, at 1 m/s, with the codebooks of a library; by '
              'default, with the band plan and its library')
-    add('--record', type=output_file, metavar='FILE', help='recording to write (MCAP)')
-    add('--picture', type=picture_file, default='demo.png', metavar='FILE',
+    add('--record', type=arguments.output_file, metavar='FILE', help='recording to write (MCAP)')
+    add('--picture', type=arguments.picture_file, default='demo.png', metavar='FILE',
         help='file to draw: PNG, PDF or SVG')
     return parser
 

@@ -17,13 +17,7 @@ from rhs_isac_ros.ros.endpoints import subscribe_messages
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float
 from rhs_isac_ros.support.optional import optional_import
-from rhs_isac_ros.tools.command import (
-    entry,
-    expecting_cycles,
-    none_within,
-    observe,
-    print_now,
-)
+from rhs_isac_ros.tools import command
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -171,9 +165,9 @@ def _show_live(arguments: Sequence[str]) -> int:
                 else:
                     with console.capture() as text:
                         console.print(view)
-                    print_now(text.get())
+                    command.print_now(text.get())
             return False
-        observe(WatchNode, arguments, refresh)
+        command.observe(WatchNode, arguments, refresh)
     return 0
 
 
@@ -187,11 +181,11 @@ def _print_once(timeout_s: float, arguments: Sequence[str]) -> int:
         return now_s > end_s or bool(
             any(node.overview.users.values())
             and now_s > node.overview.began_s + _DIAGNOSTICS_TIMEOUT_S)
-    node = observe(lambda: expecting_cycles(WatchNode()), arguments, done)
+    node = command.observe(lambda: command.expecting_cycles(WatchNode()), arguments, done)
     if any(node.overview.users.values()):
         Console().print(render(node.overview, time.monotonic()))
     elif time.monotonic() > end_s:
-        raise none_within('no complete cycle', timeout_s)
+        raise command.none_within('no complete cycle', timeout_s)
     return 0
 
 
@@ -206,4 +200,4 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-main = entry(_watch, _parser)
+main = command.entry(_watch, _parser)

@@ -16,14 +16,6 @@ from rhs_isac_ros.codebook import (
     optimize,
     random_codebook,
 )
-from rhs_isac_ros.codebook.methods import (
-    minimize_alternating,
-    minimize_direct,
-    minimize_exactly,
-    minimize_genetic,
-    minimize_interior_point,
-    run_lbfgs,
-)
 from rhs_isac_ros.codebook.objective import OBJECTIVES, ambiguity
 from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Search
 from rhs_isac_ros.model import Scenario
@@ -35,7 +27,7 @@ ALL = np.ones(20, bool)
 
 def minimize_all(search):
     """The interior-point method on all variables."""
-    minimize_interior_point(search, search.start, ALL, search.max_steps)
+    methods.minimize_interior_point(search, search.start, ALL, search.max_steps)
 
 
 class Case(NamedTuple):
@@ -48,10 +40,10 @@ class Case(NamedTuple):
 
 
 CASES = {
-    'alternating': Case(minimize_alternating, 800, 0.02, None),
-    'direct': Case(minimize_direct, 400, 0.02, '5 steps at most'),
+    'alternating': Case(methods.minimize_alternating, 800, 0.02, None),
+    'direct': Case(methods.minimize_direct, 400, 0.02, '5 steps at most'),
     'interior point': Case(minimize_all, 400, 0.02, None),
-    'lbfgs': Case(minimize_exactly, 200, 1e-3, 'max_steps reached'),
+    'lbfgs': Case(methods.minimize_exactly, 200, 1e-3, 'max_steps reached'),
 }
 GRADIENT = pytest.mark.parametrize('case', CASES.values(), ids=CASES)
 
@@ -80,7 +72,7 @@ def test_begins_at_the_start_and_stops_at_the_limit_of_steps(
     np.testing.assert_array_equal(problem.points[0], search.start)
     assert len(search.history) <= max_steps
     assert search.value_m2 < problem.value(search.start)
-    if case.minimize is not minimize_alternating:
+    if case.minimize is not methods.minimize_alternating:
         assert len(search.history) == max_steps
     if max_steps == 5 and case.at_limit:
         assert reason == case.at_limit
@@ -88,7 +80,7 @@ def test_begins_at_the_start_and_stops_at_the_limit_of_steps(
 
 @pytest.mark.slow
 @pytest.mark.parametrize('unit', [2.0**-40, 2.0**10, 2.0**40])
-@pytest.mark.parametrize('minimize', [minimize_exactly, minimize_direct])
+@pytest.mark.parametrize('minimize', [methods.minimize_exactly, methods.minimize_direct])
 def test_the_unit_of_the_objective_does_not_matter(quadratic, search_of, minimize, unit):
     """In nanometres or in kilometres, the steps are the same."""
     class Scaled(quadratic):
@@ -111,7 +103,7 @@ def test_changes_only_the_free_variables_and_finds_their_minimum(quadratic, sear
     free = np.random.default_rng(seed).uniform(size=20) < 0.5
     assert free[:10].any() and free[10:].any() and not free.all()
     start = np.linspace(0.3, 0.6, 20)
-    found = minimize_interior_point(search_of(problem, start=start), start, free, 400)
+    found = methods.minimize_interior_point(search_of(problem, start=start), start, free, 400)
     assert len(problem.points) > 5
     for point in problem.points:
         np.testing.assert_array_equal(point[~free], start[~free])
@@ -154,7 +146,7 @@ def test_changes_only_analog_in_sp1_and_only_digital_in_sp2(quadratic, search_of
     """Each sub-problem starts at the best point of the last."""
     problem = quadratic(1)
     search = search_of(problem, 80, start=np.linspace(0.2, 0.8, 20))
-    minimize_alternating(search)
+    methods.minimize_alternating(search)
     assert len(sub_problems) >= 4
     np.testing.assert_array_equal(sub_problems[0].start, search.start)
     for before, after in itertools.pairwise(sub_problems):
@@ -173,7 +165,7 @@ def test_changes_only_analog_in_sp1_and_only_digital_in_sp2(quadratic, search_of
 def test_sub_problems_share_the_steps_evenly(quadratic, search_of, sub_problems, max_steps, each):
     """Table I: 4 iterations with 50 steps each of sP1 and of sP2."""
     search = search_of(quadratic(2), max_steps)
-    minimize_alternating(search)
+    methods.minimize_alternating(search)
     assert {sub_problem.max_steps for sub_problem in sub_problems} == {each}
     assert len(sub_problems) <= 8
     assert len(search.history) <= max_steps
@@ -190,7 +182,7 @@ def test_a_change_in_one_sub_problem_suffices_to_continue(
         return start + 0.01 * free if len(seen) - 1 in changing else start
 
     monkeypatch.setattr(methods, 'minimize_interior_point', minimize)
-    reason = minimize_alternating(search_of(flat, 80))
+    reason = methods.minimize_alternating(search_of(flat, 80))
     assert len(seen) == calls
     assert reason == f'iteration {calls // 2} changed nothing'
 
@@ -215,7 +207,7 @@ def test_improves_with_every_generation_and_stays_in_range(
     problem = quadratic(seed)
     start = np.full(20, 0.5)
     search = search_of(problem, 6, start=start, seed=seed)
-    assert minimize_genetic(search) == '6 generations'
+    assert methods.minimize_genetic(search) == '6 generations'
     assert len(search.history) == 6
     values = [entry.value_m2 for entry in search.history]
     assert values == sorted(values, reverse=True)
@@ -230,7 +222,7 @@ def test_improves_with_every_generation_and_stays_in_range(
 def test_the_generator_determines_all_points(quadratic, search_of, pymoo):
     def points(seed):
         problem = quadratic(0)
-        minimize_genetic(search_of(problem, 2, seed=seed))
+        methods.minimize_genetic(search_of(problem, 2, seed=seed))
         return np.array(problem.points)
 
     one, same, other = points(1), points(1), points(2)
@@ -266,7 +258,7 @@ def search_from(problem, scenario):
 def test_samples_lead_to_the_value_that_all_pairs_lead_to(search_from):
     search, plain = search_from(120), search_from(60)
     methods.minimize_sampled(search, ROUNDS)
-    minimize_exactly(plain)
+    methods.minimize_exactly(plain)
     start = search.history[0].value_m2
     assert plain.value_m2 < 0.6 * start
     assert search.value_m2 < plain.value_m2 + 0.05 * start
@@ -368,7 +360,8 @@ def test_optimised_levels_beat_rounding(continuous, levels):
         value, gradient = problem.value_and_gradient(np.concatenate([analog, digital]))
         return value, gradient[problem.n_analog:]
 
-    best = run_lbfgs(objective, digital, problem.bounds[problem.n_analog:], 200, lambda: None)
+    best = methods.run_lbfgs(
+        objective, digital, problem.bounds[problem.n_analog:], 200, lambda: None)
     assert found < 0.95 * objective(best.x)[0] < 0.95 * problem.value(rounded)
     assert continuous.history[-1].value_m2 < found
     assert result.codebook.average_crlb_m2 == pytest.approx(found, rel=2e-3)
@@ -379,7 +372,7 @@ def test_the_penalty_moves_the_amplitudes_to_the_levels(monkeypatch):
     rounds = []
 
     def recording(objective, *arguments):
-        result = run_lbfgs(objective, *arguments)
+        result = methods.run_lbfgs(objective, *arguments)
         rounds.append((objective, result.x))
         return result
 

@@ -8,14 +8,6 @@ import pytest
 
 from rhs_isac_ros.bounds import PairwiseErrorCost, crlb
 from rhs_isac_ros.codebook import OBJECTIVES, SAMPLINGS, objective, optimize, random_codebook
-from rhs_isac_ros.codebook.objective import (
-    WIDE,
-    ambiguity,
-    average_bound,
-    confusable_volumes,
-    draw_confusable,
-    sobol,
-)
 from rhs_isac_ros.codebook.problem import Problem
 from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
@@ -24,7 +16,7 @@ from rhs_isac_ros.model.multipath import multipath_covariance
 def test_the_relative_error_of_the_average_bound_is_below_a_thousandth(table1, shipped):
     scenario = table1.scenario
     positions = scenario.sample_positions(200, np.random.default_rng(0))
-    bound = average_bound(scenario, positions, np.random.default_rng(0))
+    bound = objective.average_bound(scenario, positions, np.random.default_rng(0))
     for codebook in (shipped, random_codebook(scenario, np.random.default_rng(1))):
         exact = crlb(scenario, codebook, positions).mean()
         assert bound.value(codebook) == pytest.approx(exact, rel=1e-3)
@@ -37,9 +29,9 @@ def test_ambiguity_is_the_pairwise_error_cost_of_the_plain_equations(
     monkeypatch.setattr(objective, '_PAIRS_PER_POSITION', 5)
     rng = np.random.default_rng(seed)
     codebook, positions = random_beams(scenario, rng), scenario.sample_positions(4, rng)
-    value = ambiguity(scenario, positions, np.random.default_rng(seed)).value(codebook)
+    value = objective.ambiguity(scenario, positions, np.random.default_rng(seed)).value(codebook)
     firsts = np.array([position for position in positions for _ in range(5)])
-    seconds = draw_confusable(scenario, firsts, np.random.default_rng(seed))
+    seconds = objective.draw_confusable(scenario, firsts, np.random.default_rng(seed))
     p = plain(scenario, codebook.analog, codebook.digital)
     inverse = np.linalg.inv(p.covariance(0, multipath_covariance(scenario)[0]))
     total = 0.0
@@ -84,8 +76,8 @@ def test_error_weights_pairs_by_a_power_of_their_volumes(scenario, random_beams,
     codebook, positions = random_beams(scenario, rng), scenario.sample_positions(4, rng)
     value = OBJECTIVES['error'](scenario, positions, np.random.default_rng(1)).value(codebook)
     firsts = np.repeat(positions, 5, axis=0)
-    seconds = draw_confusable(scenario, firsts, np.random.default_rng(1), WIDE)
-    volumes = confusable_volumes(scenario, firsts, seconds, WIDE)
+    seconds = objective.draw_confusable(scenario, firsts, np.random.default_rng(1), objective.WIDE)
+    volumes = objective.confusable_volumes(scenario, firsts, seconds, objective.WIDE)
     costs = np.array([PairwiseErrorCost(scenario, a[None], b[None]).value(codebook)
                       for a, b in zip(firsts, seconds, strict=True)])
     expected = np.sum(volumes**0.6 * costs) / np.sum(volumes**0.6)
@@ -109,7 +101,8 @@ def test_optimising_the_ambiguity_lowers_it_on_held_out_pairs(scenario):
                       max_steps=30)
     rng = np.random.default_rng(99)
     firsts = scenario.sample_positions(1500, rng)
-    held_out = PairwiseErrorCost(scenario, firsts, draw_confusable(scenario, firsts, rng))
+    held_out = PairwiseErrorCost(
+        scenario, firsts, objective.draw_confusable(scenario, firsts, rng))
     start = random_codebook(scenario, np.random.default_rng(1))
     bound = optimize(scenario, n_positions=128, seed=1, max_steps=30)
     found = held_out.value(result.codebook)
@@ -170,7 +163,7 @@ def test_samples_are_in_the_region_and_depend_on_the_generator(name, n):
 @pytest.mark.parametrize('n', [1, 2, 128])
 def test_sobol_puts_one_point_in_each_slice(n, seed):
     low, high = LOPSIDED.roi_bounds_m
-    unit = (sobol(LOPSIDED, n, np.random.default_rng(seed)) - low) / (high - low)
+    unit = (objective.sobol(LOPSIDED, n, np.random.default_rng(seed)) - low) / (high - low)
     np.testing.assert_array_equal(
         np.sort(np.floor(unit * n), axis=0), np.tile(np.arange(n)[:, None], 3))
 
@@ -184,7 +177,8 @@ def test_confusable_positions_differ_and_are_in_the_region(region, bands):
         scenario.sample_positions(300, np.random.default_rng(0)), scenario.roi_bounds_m])
     before = positions.copy()
     one, same, other = (
-        draw_confusable(scenario, positions, np.random.default_rng(seed)) for seed in (1, 1, 2))
+        objective.draw_confusable(scenario, positions, np.random.default_rng(seed))
+        for seed in (1, 1, 2))
     np.testing.assert_array_equal(positions, before)
     assert one.shape == positions.shape
     assert ((one >= low) & (one <= high)).all()
@@ -199,7 +193,7 @@ def lags_of(bands, n=20_000):
     """Return the range lags below 20 m of positions at the centre of a wide region."""
     scenario = dataclasses.replace(WIDE_REGION, center_frequencies_hz=BANDS[bands])
     positions = np.tile([50.0, 0, 0], (n, 1))
-    others = draw_confusable(scenario, positions, np.random.default_rng(3))
+    others = objective.draw_confusable(scenario, positions, np.random.default_rng(3))
     lags = np.linalg.norm(others, axis=1) - 50
     same = np.abs(lags) < 1e-9
     assert same.mean() == pytest.approx(0.3, abs=0.02)
@@ -235,7 +229,7 @@ def test_confusable_positions_lie_within_a_beam(side):
     """Smaller surfaces have wider beams; the elements are 0.3 wavelengths apart."""
     scenario = dataclasses.replace(WIDE_REGION, elements_per_side=side)
     positions = np.tile([50.0, 0, 0], (5000, 1))
-    others = draw_confusable(scenario, positions, np.random.default_rng(3))
+    others = objective.draw_confusable(scenario, positions, np.random.default_rng(3))
     angles = np.arctan2(np.linalg.norm(others[:, 1:], axis=1), others[:, 0])
     wavelengths = SPEED_OF_LIGHT_MPS / np.array([2.5e9, 3e9])
     width = wavelengths.min() / (side * 0.3 * wavelengths.mean())
@@ -250,7 +244,7 @@ def test_confusable_positions_lie_within_a_beam(side):
 def test_thin_regions_have_confusable_pairs(size):
     scenario = Scenario(roi_size_m=size)
     positions = scenario.sample_positions(200, np.random.default_rng(0))
-    others = draw_confusable(scenario, positions, np.random.default_rng(1))
+    others = objective.draw_confusable(scenario, positions, np.random.default_rng(1))
     low, high = scenario.roi_bounds_m
     assert ((others >= low) & (others <= high)).all()
     assert np.mean((others != positions).any(axis=1)) > 0.9
@@ -261,8 +255,9 @@ def test_sums_weighted_with_volumes_are_integrals():
     scenario = dataclasses.replace(WIDE_REGION, center_frequencies_hz=(2.5e9,))
     centre = np.array([50.0, 0, 0])
     positions = np.tile(centre, (60_000, 1))
-    others = draw_confusable(scenario, positions, np.random.default_rng(3), WIDE)
-    volumes = confusable_volumes(scenario, positions, others, WIDE)
+    others = objective.draw_confusable(
+        scenario, positions, np.random.default_rng(3), objective.WIDE)
+    volumes = objective.confusable_volumes(scenario, positions, others, objective.WIDE)
     scale = np.array([12.0, 8.0, 8.0])
 
     def average(shift):
@@ -279,7 +274,7 @@ def test_pairs_in_a_flat_region_keep_their_height_and_their_lags(height):
     """Range lags are whole periods of the bands, as in a region with an extent."""
     scenario = Scenario(roi_center_m=(50, 0, height), roi_size_m=(40, 40, 0))
     positions = np.tile([50.0, 0, height], (4000, 1))
-    others = draw_confusable(scenario, positions, np.random.default_rng(0))
+    others = objective.draw_confusable(scenario, positions, np.random.default_rng(0))
     assert (others[:, 2] == height).all()
     lags = np.abs(np.linalg.norm(others, axis=1) - np.linalg.norm(positions, axis=1))
     lags = lags[(lags > 0.3) & (lags < 15)]

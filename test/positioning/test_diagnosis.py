@@ -9,23 +9,13 @@ from scipy.stats import chi2, gamma
 
 from rhs_isac_ros.model import Scenario, simulate_received
 from rhs_isac_ros.model.gaussian import FALSE_ALARM
-from rhs_isac_ros.positioning import Estimate, make_estimator
+from rhs_isac_ros.positioning import Estimate, diagnosis, make_estimator
 from rhs_isac_ros.positioning.alternatives import (
     LIMIT,
     Blocked,
     Outside,
     describe_doubts,
     rejection,
-)
-from rhs_isac_ros.positioning.diagnosis import (
-    LEVEL,
-    MIN_RESIDUALS,
-    MIN_RETURN,
-    SPREAD,
-    WINDOW,
-    FitTest,
-    InnovationTest,
-    diagnose,
 )
 from rhs_isac_ros.system import System
 
@@ -52,7 +42,7 @@ def assert_no_fix(estimate, message):
 
 
 def test_limits_are_quantiles_of_the_chi_square_distribution():
-    test = FitTest(64)
+    test = diagnosis.FitTest(64)
     assert 2 * test.min_energy == pytest.approx(chi2.ppf(FALSE_ALARM, 128))
     assert 2 * test.max_residual == pytest.approx(chi2.isf(FALSE_ALARM, 128))
     for check, limit, sign in ((test.min_energy_test, test.min_energy, -1),
@@ -63,16 +53,16 @@ def test_limits_are_quantiles_of_the_chi_square_distribution():
 
 def test_weak_signals_are_a_direct_path_or_nothing():
     """Multipath may be weaker than in the model, as in an empty hall."""
-    test = FitTest(64)
+    test = diagnosis.FitTest(64)
     assert test.weak_test(1.0, 0.1) == ''
     assert test.weak_test(test.min_energy, 1e3) == ''
     assert 'expected at most 0.723 of signals weaker' in test.weak_test(1.0, 0.8)
     # A survey inflates the covariance, relative to which the usual multipath is weak.
-    assert FitTest(64, 0.1).weak_test(test.min_energy / 9, 1e3) == ''
+    assert diagnosis.FitTest(64, 0.1).weak_test(test.min_energy / 9, 1e3) == ''
 
 
 def test_the_largest_energy_is_that_of_the_strongest_position_with_noise():
-    test = FitTest(64)
+    test = diagnosis.FitTest(64)
     limit = (np.sqrt(500.0) + np.sqrt(test.max_residual))**2
     assert test.max_energy_test(limit * 0.999, 500.0) == ''
     assert f'expected at most {limit:.3g}' in test.max_energy_test(limit * 1.001, 500.0)
@@ -148,7 +138,7 @@ def energies(n, scale=1.0, seed=0):
 
 
 def filled(values, *arguments, expected=EXPECTED):
-    test = InnovationTest(*arguments)
+    test = diagnosis.InnovationTest(*arguments)
     for value in values:
         test.add(float(value), expected)
     return test
@@ -156,7 +146,7 @@ def filled(values, *arguments, expected=EXPECTED):
 
 def without_warning(values, *arguments, expected=EXPECTED):
     """Return a test after residuals, none of which causes a warning."""
-    test = InnovationTest(*arguments)
+    test = diagnosis.InnovationTest(*arguments)
     for value in values:
         test.add(float(value), expected)
         assert not test.drifts
@@ -166,25 +156,25 @@ def without_warning(values, *arguments, expected=EXPECTED):
 @pytest.mark.slow
 def test_residuals_of_the_model_cause_no_warning():
     test = without_warning(energies(2500))
-    assert test.n_residuals == WINDOW
+    assert test.n_residuals == diagnosis.WINDOW
     assert test.ratio == pytest.approx(1, abs=0.03)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('scale', [0.93, 1.07])
 def test_slightly_wrong_residuals_cause_a_warning_after_some_fixes(scale):
-    values = energies(4 * WINDOW, scale)
-    assert not filled(values[:MIN_RESIDUALS]).drifts
+    values = energies(4 * diagnosis.WINDOW, scale)
+    assert not filled(values[:diagnosis.MIN_RESIDUALS]).drifts
     # A small deviation does not come and go.
     for n in range(1, 5):
-        test = filled(values[:n * WINDOW])
+        test = filled(values[:n * diagnosis.WINDOW])
         assert test.drifts
         assert test.ratio == pytest.approx(scale, abs=0.03)
 
 
 def test_residuals_that_vary_too_much_cause_a_warning():
     """Their mean alone would not: most of the excess of a few phases is made up by others."""
-    values = energies(WINDOW)
+    values = energies(diagnosis.WINDOW)
     mean = EXPECTED * 1.02
     test = filled(mean + 1.6 * (values - EXPECTED))
     assert test.drifts
@@ -197,54 +187,56 @@ def test_residuals_that_vary_too_much_cause_a_warning():
 def test_the_variance_of_the_model_causes_no_warning(shape):
     """Energies of few measurements have a skewed distribution."""
     rng = np.random.default_rng(4)
-    for window in rng.standard_gamma(shape, (100, MIN_RETURN)):
-        without_warning(window, MIN_RETURN, expected=shape)
+    for window in rng.standard_gamma(shape, (100, diagnosis.MIN_RETURN)):
+        without_warning(window, diagnosis.MIN_RETURN, expected=shape)
 
 
 @pytest.mark.parametrize('level_db', [-4.5, -3.0, -1.0])
 def test_a_user_at_rest_may_have_any_usual_level(level_db):
     """The level of a measured covariance differs among users, here by 1 dB, and stays the same."""
-    values = energies(WINDOW, 10**(level_db / 10))
-    test = without_warning(values, WINDOW, (-3.0, 1.0))
+    values = energies(diagnosis.WINDOW, 10**(level_db / 10))
+    test = without_warning(values, diagnosis.WINDOW, (-3.0, 1.0))
     assert test.ratio == pytest.approx(10**((level_db + 3) / 10), rel=0.03)
-    assert filled(values, WINDOW, (-3.0, 0.0)).drifts == (level_db != -3.0)
+    assert filled(values, diagnosis.WINDOW, (-3.0, 0.0)).drifts == (level_db != -3.0)
 
 
 def test_levels_of_many_users_are_no_excess_of_the_variance():
-    levels = 10**(np.random.default_rng(1).normal(0, 0.1, WINDOW))
-    test = filled(levels * energies(WINDOW), WINDOW, (0.0, 1.0))
+    levels = 10**(np.random.default_rng(1).normal(0, 0.1, diagnosis.WINDOW))
+    test = filled(levels * energies(diagnosis.WINDOW), diagnosis.WINDOW, (0.0, 1.0))
     assert not test.drifts
     assert test.spread == pytest.approx(1, abs=0.2)
 
 
 def test_a_level_far_from_the_survey_causes_a_warning():
-    assert filled(energies(MIN_RESIDUALS, 10**-1.3), WINDOW, (-3.0, 1.0)).drifts
+    residuals = energies(diagnosis.MIN_RESIDUALS, 10**-1.3)
+    assert filled(residuals, diagnosis.WINDOW, (-3.0, 1.0)).drifts
 
 
 def test_few_residuals_are_not_judged():
-    assert not filled([1e6] * (MIN_RESIDUALS - 1)).drifts
-    assert filled([1e6] * MIN_RESIDUALS).drifts
+    assert not filled([1e6] * (diagnosis.MIN_RESIDUALS - 1)).drifts
+    assert filled([1e6] * diagnosis.MIN_RESIDUALS).drifts
 
 
-@pytest.mark.parametrize('window', [-1, 0, MIN_RETURN - 1])
+@pytest.mark.parametrize('window', [-1, 0, diagnosis.MIN_RETURN - 1])
 def test_a_window_without_an_end_of_warnings_is_an_error(window):
-    with pytest.raises(ValueError, match=f'^window: {window}, expected at least {MIN_RETURN}$'):
-        InnovationTest(window)
+    expected = f'^window: {window}, expected at least {diagnosis.MIN_RETURN}$'
+    with pytest.raises(ValueError, match=expected):
+        diagnosis.InnovationTest(window)
 
 
 def test_a_warning_ends_after_some_residuals_of_the_model():
-    values = energies(3 * MIN_RETURN)
-    bad = energies(WINDOW, 2.0)
-    assert filled([*bad, *values[:MIN_RETURN // 2]]).drifts
+    values = energies(3 * diagnosis.MIN_RETURN)
+    bad = energies(diagnosis.WINDOW, 2.0)
+    assert filled([*bad, *values[:diagnosis.MIN_RETURN // 2]]).drifts
     test = filled([*bad, *values])
     assert not test.drifts
     # What preceded the end of the warning is forgotten.
-    assert test.n_residuals < WINDOW
-    assert filled([*bad, *values, *energies(MIN_RETURN, 2.0, 1)]).drifts
+    assert test.n_residuals < diagnosis.WINDOW
+    assert filled([*bad, *values, *energies(diagnosis.MIN_RETURN, 2.0, 1)]).drifts
 
 
 def test_residuals_are_forgotten_on_request():
-    test = filled(energies(WINDOW, 2.0))
+    test = filled(energies(diagnosis.WINDOW, 2.0))
     test.clear()
     assert not test.drifts
     assert test.n_residuals == 0
@@ -255,7 +247,7 @@ def test_residuals_are_forgotten_on_request():
 @pytest.mark.parametrize(('energy', 'expected'), [
     (math.nan, EXPECTED), (1e6, math.nan), (1e6, math.inf), (math.nan, math.nan)])
 def test_estimates_without_a_residual_or_an_expectation_are_ignored(energy, expected):
-    test = filled([energy] * WINDOW, expected=expected)
+    test = filled([energy] * diagnosis.WINDOW, expected=expected)
     assert not test.drifts
     assert test.n_residuals == 0
 
@@ -287,7 +279,7 @@ def one(found, row):
 
 
 def diagnosis_of(found, deviates):
-    return diagnose([one(found, row) for row in range(len(found.mean))], deviates)
+    return diagnosis.diagnose([one(found, row) for row in range(len(found.mean))], deviates)
 
 
 def located(world, codebook, estimator):
@@ -298,9 +290,9 @@ def located(world, codebook, estimator):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('change', 'cause'), [
-    ({'multipath_to_los_db': Scenario().multipath_to_los_db + 6}, LEVEL),
-    ({'delay_spread_s': 2 * Scenario().delay_spread_s}, SPREAD),
-    ({'angular_spread_deg': 3 * Scenario().angular_spread_deg}, SPREAD)],
+    ({'multipath_to_los_db': Scenario().multipath_to_los_db + 6}, diagnosis.LEVEL),
+    ({'delay_spread_s': 2 * Scenario().delay_spread_s}, diagnosis.SPREAD),
+    ({'angular_spread_deg': 3 * Scenario().angular_spread_deg}, diagnosis.SPREAD)],
     ids=['level', 'delays', 'angles'])
 def test_wrong_levels_and_spreads_of_the_multipath_are_told_apart(
         change, cause, shipped, table1_estimator):
@@ -318,7 +310,7 @@ def test_blocked_users_are_the_cause_unless_the_residuals_deviate(shipped):
     assert values['no_fix.cause'] == Blocked.reason
     assert float(values['probability.blocked']) == pytest.approx(0.3, abs=0.12)
     assert 'probability.outside' not in values
-    assert diagnosis_of(found, True)['no_fix.cause'] in (LEVEL, SPREAD)
+    assert diagnosis_of(found, True)['no_fix.cause'] in (diagnosis.LEVEL, diagnosis.SPREAD)
 
 
 def test_signals_of_the_model_have_no_cause(shipped, table1_estimator):
@@ -328,9 +320,9 @@ def test_signals_of_the_model_have_no_cause(shipped, table1_estimator):
 def test_few_residuals_leave_the_reason_as_the_cause():
     nothing = np.full(3, np.nan), np.full((3, 3), np.nan)
     estimate = Estimate(*nothing, 'residual energy: 9, expected at most 5', 9.0, 3.0)
-    values = diagnose([estimate] * (MIN_RESIDUALS - 1), True)
+    values = diagnosis.diagnose([estimate] * (diagnosis.MIN_RESIDUALS - 1), True)
     assert values['no_fix.cause'] == 'residual energy'
-    assert diagnose([Estimate(np.zeros(3), np.eye(3))], True) == {}
+    assert diagnosis.diagnose([Estimate(np.zeros(3), np.eye(3))], True) == {}
 
 
 def test_doubts_are_described_from_one_percent_on():

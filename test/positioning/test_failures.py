@@ -11,19 +11,9 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import blocks
 from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
 from rhs_isac_ros.model.geometry import jacobian, to_polar, to_positions
-from rhs_isac_ros.positioning import alternatives, make_estimator
+from rhs_isac_ros.positioning import alternatives, failures, make_estimator
 from rhs_isac_ros.positioning.alternatives import Blocked, Outside, tabulate_outside
 from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
-from rhs_isac_ros.positioning.failures import (
-    LIMITS,
-    FailedElements,
-    FailureModel,
-    FailureSearch,
-    Whitening,
-    _diverse,
-    can_enumerate,
-    first_places,
-)
 from rhs_isac_ros.positioning.grid import Starts
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.search import OneState, ascend
@@ -47,7 +37,7 @@ def codebook(random_beams):
 
 @pytest.fixture(scope='module')
 def model(codebook):
-    return FailureModel(Likelihood(System(SCENARIO, codebook)))
+    return failures.FailureModel(Likelihood(System(SCENARIO, codebook)))
 
 
 def with_failures(elements, levels, n_elements=SCENARIO.n_elements) -> ElementErrors:
@@ -135,7 +125,8 @@ def test_element_errors_have_their_covariance_at_the_position(codebook):
     received = MeasurementModel(declared, codebook).sample(
         to_positions(points), np.random.default_rng(3))
     values = np.zeros((3, 0))
-    found = FailureModel(both).failed_set(()).local(points, values, both.signals(received))
+    found = failures.FailureModel(both).failed_set(()).local(
+        points, values, both.signals(received))
     expected = DispersedLikelihood(alone).local(points, values, alone.signals(received))
     for name in ('gradient', 'information', 'residual'):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-6)
@@ -150,7 +141,7 @@ def weighing(request, codebook):
     scenario = dataclasses.replace(SCENARIO, **request.param)
     received = MeasurementModel(scenario, codebook).sample(
         POSITION[None], np.random.default_rng(3))
-    model = FailureModel(Likelihood(System(scenario, codebook)))
+    model = failures.FailureModel(Likelihood(System(scenario, codebook)))
     # As for a large surface.
     model.surfaces.parts = blocks(36, 10)
     (site,) = model.places(
@@ -180,7 +171,7 @@ def test_the_remainder_adds_to_the_covariance(weighing, codebook, monkeypatch):
         failed = tuple(sorted((5, element)))
         surface = model.surfaces.surface(failed)
         larger = surface._replace(covariance=surface.covariance + remainder)
-        whitening = Whitening.of(larger.covariance[None], model.likelihood.nuisance)
+        whitening = failures.Whitening.of(larger.covariance[None], model.likelihood.nuisance)
         monkeypatch.setattr(model.surfaces, 'whitening', lambda _, whitening=whitening: whitening)
         (expected,), _ = model.weigh(failed, [site])
         assert values[element] == pytest.approx(expected, **tolerance(model))
@@ -207,14 +198,14 @@ def test_a_few_failures_cost_little_accuracy(codebook):
 @pytest.mark.parametrize('share, enumerated', [(0.0, False), (0.02, True), (0.5, False)])
 def test_sets_are_searched_if_failures_are_rare(share, enumerated):
     scenario = dataclasses.replace(SCENARIO, failed_element_share=share)
-    assert can_enumerate(scenario) is enumerated
+    assert failures.can_enumerate(scenario) is enumerated
 
 
 @pytest.fixture(scope='module')
 def ambiguous(random_beams):
     """The model of two bands."""
     codebook = random_beams(AMBIGUOUS, np.random.default_rng(1))
-    return FailureModel(Likelihood(System(AMBIGUOUS, codebook)))
+    return failures.FailureModel(Likelihood(System(AMBIGUOUS, codebook)))
 
 
 def sample_with(model, failed, seed):
@@ -226,7 +217,7 @@ def sample_with(model, failed, seed):
 
 
 def search_at_the_truth(model, received):
-    search = FailureSearch(model, model.likelihood.signals(received))
+    search = failures.FailureSearch(model, model.likelihood.signals(received))
     return search, search.add(POINT[None], NO_VALUES[None])
 
 
@@ -247,7 +238,7 @@ def test_users_elsewhere_have_the_evidence_of_the_true_set(
     """Relative to an average over surfaces, and up to the sets that explain signals as well."""
     failed, point = (3, 17), np.array([[range_m, 0.2, -0.1]])
     likelihood = Likelihood(System(SCENARIO, codebook))
-    elements, average = FailedElements(likelihood), DispersedLikelihood(likelihood)
+    elements, average = failures.FailedElements(likelihood), DispersedLikelihood(likelihood)
     surface = MeasurementModel(SCENARIO, codebook, with_failures(failed, [0.1, 0.8]))
     received = 10**(level_db / 20) * surface.sample(
         to_positions(point), np.random.default_rng(3))
@@ -270,8 +261,8 @@ def test_users_who_walk_have_the_failed_elements_of_users_at_rest(codebook, mode
     """Sets are compared with sets, also in another scenario."""
     walking = Likelihood(System(dataclasses.replace(
         SCENARIO, frame_duration_s=0.015, user_speed_std_mps=1.0), codebook))
-    at_rest, found = model.failed_set((3, 17)), FailedElements(walking)
-    known = FailureModel(walking).failed_set((3, 17))
+    at_rest, found = model.failed_set((3, 17)), failures.FailedElements(walking)
+    known = failures.FailureModel(walking).failed_set((3, 17))
     signals = walking.signals(MeasurementModel(SCENARIO, codebook).sample(
         POSITION[None], np.random.default_rng(2)))
     values = np.zeros((1, len(walking.nuisance)))
@@ -282,7 +273,7 @@ def test_users_who_walk_have_the_failed_elements_of_users_at_rest(codebook, mode
 def test_elements_fail_at_the_place_of_each_frame():
     """What a failure changes is linear in the elements, also while users walk."""
     system, rng = system_of(failed_element_share=0.01), np.random.default_rng(2)
-    model = FailureModel(Likelihood(system))
+    model = failures.FailureModel(Likelihood(system))
     prior, intact = model.likelihood.nuisance, dataclasses.replace(
         system.scenario, failed_element_share=0.0)
     state = users_of(system.scenario, 1, 1.0, rng)
@@ -309,7 +300,7 @@ def test_sets_of_a_small_surface_grow_to_all_elements(random_beams):
     scenario = dataclasses.replace(
         AMBIGUOUS, elements_per_side=2, failed_element_share=0.1)
     codebook = random_beams(scenario, np.random.default_rng(1))
-    model = FailureModel(Likelihood(System(scenario, codebook)))
+    model = failures.FailureModel(Likelihood(System(scenario, codebook)))
     strong = 100 * MeasurementModel(scenario, codebook).mean(POSITION[None])
     search, sites = search_at_the_truth(model, strong)
     search.grow(sites)
@@ -318,12 +309,12 @@ def test_sets_of_a_small_surface_grow_to_all_elements(random_beams):
 
 def test_few_hypotheses_of_each_set_and_of_each_site_are_extended():
     ranked = [((1,), site) for site in range(10)] + [((set_,), 0) for set_ in range(2, 20)]
-    chosen = _diverse(ranked)
+    chosen = failures._diverse(ranked)
     sets, sites = (collections.Counter(one) for one in zip(*chosen, strict=True))
-    assert max(sets.values()) == LIMITS.per_set
-    assert max(sites.values()) == LIMITS.per_place
-    different = [((number,), number) for number in range(2 * LIMITS.extended)]
-    assert _diverse(different) == different[:LIMITS.extended]
+    assert max(sets.values()) == failures.LIMITS.per_set
+    assert max(sites.values()) == failures.LIMITS.per_place
+    different = [((number,), number) for number in range(2 * failures.LIMITS.extended)]
+    assert failures._diverse(different) == different[:failures.LIMITS.extended]
 
 
 def test_neighbours_differ_by_one_element(ambiguous):
@@ -339,10 +330,10 @@ def test_neighbours_differ_by_one_element(ambiguous):
 def test_sets_grow_from_the_best_points_and_from_the_best_of_each_direction():
     # 100 ranges in each of three directions, the more probable direction first.
     points = np.array([(4 + 0.01 * n, u, 0.1) for u in (0.05, 0.35, 0.65) for n in range(100)])
-    chosen = first_places(points, np.array([0.1, 0.1, 0.1]))
+    chosen = failures.first_places(points, np.array([0.1, 0.1, 0.1]))
     assert len(set(chosen)) == 64
     assert chosen[:32] == list(range(32))
     # The first direction has had its turns.
     assert chosen[32:] == [n for pair in zip(range(100, 116), range(200, 216), strict=True)
                            for n in pair]
-    assert first_places(points[:5], np.ones(3)) == list(range(5))
+    assert failures.first_places(points[:5], np.ones(3)) == list(range(5))

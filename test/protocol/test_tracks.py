@@ -10,14 +10,8 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.mobility import Waypoints
 from rhs_isac_ros.positioning import BayesEstimator
 from rhs_isac_ros.positioning.tracking import MAX_GAP_S
+from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import (
-    CodebookOffered,
-    EstimatorBuilt,
-    PauseRequested,
-    PrepareEstimator,
-    ResumeRequested,
-)
 from rhs_isac_ros.protocol.positioner import Positioner, Tracks
 from rhs_isac_ros.protocol.settings import PositionerSettings
 from rhs_isac_ros.system import System
@@ -230,9 +224,9 @@ def test_a_cycle_without_service_is_followed_by_one_for_the_whole_region(
 
 
 def pause(network):
-    network.dispatch('bs', PauseRequested())
+    network.dispatch('bs', events.PauseRequested())
     network.run(limit_s=3.0)
-    network.dispatch('bs', ResumeRequested())
+    network.dispatch('bs', events.ResumeRequested())
 
 
 @pytest.mark.parametrize('interrupt', [pause, lambda network: network.restart('user1')],
@@ -281,10 +275,10 @@ def test_estimators_of_a_library_leave_out_as_few_modes_as_the_positioner_does(
     """In a site, for example."""
     role, cell = Positioner(scenario, lambda: 0.0, TRACK, library=library,
                             left_out=5e-5), library.codebooks[0]
-    feed(role, [CodebookOffered(region), EstimatorBuilt(region, estimator)])
+    feed(role, [events.CodebookOffered(region), events.EstimatorBuilt(region, estimator)])
     (signals,) = MeasurementModel(scenario, cell).sample(PLACE[None], np.random.default_rng(0))
     actions = role.handle(m.ReceivedSignals(
         cycle_id=3, user=2, user_instance=7, codebook_id=cell.id, stamp_ns=5,
         signals=signals.reshape(cell.shape[:3])), 1.0)
-    (prepared,) = (one for one in actions if isinstance(one, PrepareEstimator))
+    (prepared,) = (one for one in actions if isinstance(one, events.PrepareEstimator))
     assert prepared.estimator.left_out == 5e-5

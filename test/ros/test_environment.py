@@ -5,13 +5,7 @@ import os
 
 import pytest
 
-from rhs_isac_ros.ros.environment import (
-    check_environment,
-    check_middleware,
-    claim_domain,
-    discovery_range,
-    log_arguments,
-)
+from rhs_isac_ros.ros import environment
 
 
 @pytest.mark.parametrize(('name', 'value', 'expected'), [
@@ -29,7 +23,7 @@ from rhs_isac_ros.ros.environment import (
 def test_an_invalid_environment_variable_is_named(name, value, expected, monkeypatch, capsys):
     monkeypatch.setenv(name, value)
     with pytest.raises(SystemExit, match='2'):
-        check_environment(argparse.ArgumentParser(prog='bs'))
+        environment.check_environment(argparse.ArgumentParser(prog='bs'))
     assert (f'bs: error: environment variable {name}: {value!r}, expected {expected}'
             in capsys.readouterr().err)
 
@@ -42,7 +36,7 @@ def test_a_missing_or_damaged_profile_is_named(content, reason, monkeypatch, cap
         file.write_text(content, encoding='utf-8')
     monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', str(file))
     with pytest.raises(SystemExit, match='2'):
-        check_environment(argparse.ArgumentParser(prog='bs'))
+        environment.check_environment(argparse.ArgumentParser(prog='bs'))
     assert f"FILE: '{file}', expected an XML file: {reason}" in capsys.readouterr().err
 
 
@@ -52,11 +46,11 @@ def test_a_middleware_that_is_not_installed_is_named(name, monkeypatch, capsys):
         'rmw_implementation': '/', 'rmw_fastrtps_cpp': '/'})
     monkeypatch.setenv('RMW_IMPLEMENTATION', name)
     with pytest.raises(SystemExit, match='2'):
-        check_middleware()
+        environment.check_middleware()
     assert (f'error: environment variable RMW_IMPLEMENTATION: {name!r}, expected '
             'rmw_fastrtps_cpp\n') in capsys.readouterr().err
     monkeypatch.setenv('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp')
-    check_middleware()
+    environment.check_middleware()
 
 
 @pytest.mark.parametrize(('name', 'value'), [
@@ -65,7 +59,7 @@ def test_a_middleware_that_is_not_installed_is_named(name, monkeypatch, capsys):
     ('ROS_SECURITY_ENABLE', 'false')])
 def test_a_valid_environment_variable_is_accepted(name, value, monkeypatch):
     monkeypatch.setenv(name, value)
-    check_environment(argparse.ArgumentParser())
+    environment.check_environment(argparse.ArgumentParser())
 
 
 @pytest.mark.parametrize(('only', 'given', 'expected'), [
@@ -77,12 +71,12 @@ def test_the_older_variable_for_the_discovery_range_takes_precedence(
         monkeypatch.delenv(name, raising=False)
         if value:
             monkeypatch.setenv(name, value)
-    assert discovery_range() == expected
+    assert environment.discovery_range() == expected
 
 
 def test_claimed_domains_differ_and_have_ports_below_the_ephemeral_ones(monkeypatch):
     monkeypatch.setattr(os, 'getpid', lambda: 101)
-    domains = {int(claim_domain()) for _ in range(3)}
+    domains = {int(environment.claim_domain()) for _ in range(3)}
     assert len(domains) == 3
     assert min(domains) >= 1 and max(domains) <= 101
 
@@ -102,7 +96,7 @@ def test_a_user_without_a_home_directory_has_no_log_files(
         monkeypatch.delenv(name, raising=False)
     if value is not None:
         monkeypatch.setenv(variable, value.format(folder=tmp_path))
-    assert log_arguments() == expected
+    assert environment.log_arguments() == expected
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == bool(expected)
     assert all(line.startswith('no log files: ') and 'ROS_LOG_DIR' in line for line in lines)

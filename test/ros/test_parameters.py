@@ -21,18 +21,11 @@ from rhs_isac_ros.protocol.settings import (
     ReceiverSettings,
     TransmissionSettings,
 )
-from rhs_isac_ros.ros.parameters import (
-    CODEBOOK,
-    NODES,
-    check_arguments,
-    declare,
-    parameter_help,
-    settings_of,
-)
+from rhs_isac_ros.ros import parameters
 from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.fields import ParameterError
 
-PAIRS = [(executable, p) for executable, group in NODES.items() for p in group]
+PAIRS = [(executable, p) for executable, group in parameters.NODES.items() for p in group]
 # Nodes share the declarations of equal names, of which one is tested.
 DECLARED = {p.name: (executable, p) for executable, p in PAIRS}
 each_parameter = pytest.mark.parametrize(
@@ -62,19 +55,19 @@ def value_of(parameter, number):
         parameter.default)(number)
 
 
-@pytest.mark.parametrize('executable', NODES)
+@pytest.mark.parametrize('executable', parameters.NODES)
 def test_the_defaults_apply_with_their_types(make, executable):
-    values = vars(declare(make(), executable))
-    assert values == {p.name: p.default for p in NODES[executable]}
-    assert [type(values[p.name]) for p in NODES[executable]] == [
-        type(p.default) for p in NODES[executable]]
+    values = vars(parameters.declare(make(), executable))
+    assert values == {p.name: p.default for p in parameters.NODES[executable]}
+    assert [type(values[p.name]) for p in parameters.NODES[executable]] == [
+        type(p.default) for p in parameters.NODES[executable]]
 
 
-@pytest.mark.parametrize('executable', NODES)
+@pytest.mark.parametrize('executable', parameters.NODES)
 def test_descriptors_match_the_declarations(make, executable):
     node = make()
-    declare(node, executable)
-    for p in NODES[executable]:
+    parameters.declare(node, executable)
+    for p in parameters.NODES[executable]:
         descriptor = node.describe_parameter(p.name)
         assert descriptor.read_only == (not p.dynamic)
         assert descriptor.type == TYPES[type(p.default)]
@@ -103,7 +96,7 @@ def wrong_values(p):
 def test_an_invalid_value_is_rejected(make, executable, parameter):
     for wrong, expected in wrong_values(parameter):
         with pytest.raises(ParameterError) as caught:
-            declare(make(**{parameter.name: wrong}), executable)
+            parameters.declare(make(**{parameter.name: wrong}), executable)
         text = str(caught.value)
         assert text.startswith(f'{parameter.name}: ')
         assert str(wrong) in text
@@ -114,7 +107,7 @@ def test_an_invalid_value_is_rejected(make, executable, parameter):
 def test_the_ends_of_a_range_and_all_choices_are_valid(make, executable, parameter):
     ends = (parameter.low, parameter.high) if parameter.kind in (int, float, list) else ()
     for value in (*(value_of(parameter, end) for end in ends), *parameter.choices):
-        values = declare(make(**{parameter.name: value}), executable)
+        values = parameters.declare(make(**{parameter.name: value}), executable)
         assert getattr(values, parameter.name) == value
 
 
@@ -122,7 +115,7 @@ def test_the_ends_of_a_range_and_all_choices_are_valid(make, executable, paramet
     pair for pair in DECLARED.values() if not pair[1].dynamic])
 def test_a_parameter_that_is_not_dynamic_is_read_only(make, executable, parameter):
     node = make()
-    declare(node, executable)
+    parameters.declare(node, executable)
     # A value that would be valid at the start.
     valid = parameter.choices[-1] if parameter.choices else {
         bool: not parameter.default, int: 1, float: parameter.low, str: 'a', list: [1.0]}[
@@ -144,8 +137,8 @@ def test_the_dynamic_parameters_are_the_settings_of_the_roles():
         for field in dataclasses.fields(settings)} - {('bs', 'step_timeout_s')}
     # The node passes all of them on, with the same values.
     for executable, settings in SETTINGS.items():
-        values = types.SimpleNamespace(**{p.name: p.default for p in NODES[executable]})
-        assert settings_of(settings, values) == settings()
+        values = types.SimpleNamespace(**{p.name: p.default for p in parameters.NODES[executable]})
+        assert parameters.settings_of(settings, values) == settings()
 
 
 def test_nodes_share_declarations_of_equal_names():
@@ -270,11 +263,12 @@ def test_an_invalid_mobility_is_rejected(bench, install, name, words):
     ['-p', 'polcy:=random', '--ros-args', '-r', 'polcy:=b', '--', '-p', 'polcy:=random'],
 ], ids=['own parameters', 'of a single node', 'outside of the ROS arguments'])
 def test_other_arguments_are_accepted(words):
-    check_arguments(argparse.ArgumentParser(), 'bs', words)
+    parameters.check_arguments(argparse.ArgumentParser(), 'bs', words)
 
 
 def test_only_the_optimizer_describes_the_parameters_of_a_codebook():
-    lines = {name: parameter_help(name).splitlines() for name in ('optimizer', 'bs', 'network')}
-    for parameter in CODEBOOK:
+    lines = {name: parameters.parameter_help(name).splitlines()
+             for name in ('optimizer', 'bs', 'network')}
+    for parameter in parameters.CODEBOOK:
         assert f'  {parameter}' in lines['optimizer']
         assert f'  {parameter}' not in lines['bs'] + lines['network']

@@ -8,17 +8,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from rhs_isac_ros.support.files import (
-    ArchiveError,
-    check_writable,
-    parse_yaml,
-    read_archive,
-    read_arrays,
-    read_yaml,
-    save_or_rescue,
-    write_archive,
-    write_whole,
-)
+from rhs_isac_ros.support import files
 
 NAMES = {'one', 'two'}
 
@@ -28,14 +18,14 @@ NAMES = {'one', 'two'}
                          ids=['text', 'bytes', 'function'])
 def test_a_file_has_the_content(tmp_path, content):
     path = tmp_path / 'file'
-    write_whole(path, content)
+    files.write_whole(path, content)
     assert path.read_text(encoding='utf-8') == 'größer'
 
 
 @pytest.mark.parametrize('failing', ['replace', 'content'])
 def test_a_failing_write_leaves_only_the_old_file(tmp_path, monkeypatch, failing):
     path = tmp_path / 'file'
-    write_whole(path, 'old')
+    files.write_whole(path, 'old')
 
     def fail(*args, **kwargs):
         raise OSError('no space left')
@@ -44,7 +34,7 @@ def test_a_failing_write_leaves_only_the_old_file(tmp_path, monkeypatch, failing
         if failing != 'content':
             patch.setattr(os, failing, fail)
         with pytest.raises(OSError, match='no space left'):
-            write_whole(path, fail if failing == 'content' else 'new')
+            files.write_whole(path, fail if failing == 'content' else 'new')
     assert path.read_text(encoding='utf-8') == 'old'
     assert os.listdir(tmp_path) == ['file']
 
@@ -52,11 +42,11 @@ def test_a_failing_write_leaves_only_the_old_file(tmp_path, monkeypatch, failing
 def test_a_full_disk_is_an_error_that_names_the_file(tmp_path, full_disk):
     path = tmp_path / 'file'
     with full_disk(1024), pytest.raises(OSError, match=f"too large: '{path}'$"):
-        write_whole(path, bytes(2048))
+        files.write_whole(path, bytes(2048))
     assert not list(tmp_path.iterdir())
     # Neither is the temporary file named if it cannot even be created.
     with pytest.raises(OSError, match=f"No such file or directory: '{path}/none'$"):
-        write_whole(path / 'none', b'')
+        files.write_whole(path / 'none', b'')
 
 
 @pytest.mark.parametrize('is_rescued', [True, False])
@@ -66,9 +56,9 @@ def test_the_result_of_long_work_is_rescued(tmp_path, monkeypatch, is_rescued):
     monkeypatch.setattr('tempfile.tempdir', str(rescue))
 
     def save(target):
-        write_whole(target if is_rescued or target == path else path, 'result')
+        files.write_whole(target if is_rescued or target == path else path, 'result')
     with pytest.raises(OSError, match=f"'{path}'") as error:
-        save_or_rescue(save, path)
+        files.save_or_rescue(save, path)
     saved = list(rescue.iterdir())
     assert len(saved) == is_rescued
     for folder in saved:
@@ -77,21 +67,21 @@ def test_the_result_of_long_work_is_rescued(tmp_path, monkeypatch, is_rescued):
 
 
 def test_a_file_in_a_missing_folder_is_not_writable(tmp_path):
-    check_writable(tmp_path / 'file')
+    files.check_writable(tmp_path / 'file')
     path = tmp_path / 'none' / 'file'
     with pytest.raises(OSError, match=f'^{path}: expected a file in a directory that exists'):
-        check_writable(path)
+        files.check_writable(path)
 
 
 @pytest.fixture
 def file(tmp_path):
-    write_archive(tmp_path / 'file', {'one': np.arange(3.0), 'two': 2.0},
+    files.write_archive(tmp_path / 'file', {'one': np.arange(3.0), 'two': 2.0},
                   {'format': 4, 'text': 'é'})
     return tmp_path / 'file'
 
 
 def test_arrays_and_description_are_read_back(file):
-    arrays, about = read_archive(file, 'thing', 4, NAMES)
+    arrays, about = files.read_archive(file, 'thing', 4, NAMES)
     np.testing.assert_array_equal(arrays['one'], np.arange(3.0))
     assert (arrays['two'], about) == (2.0, {'text': 'é'})
 
@@ -99,18 +89,19 @@ def test_arrays_and_description_are_read_back(file):
 @pytest.mark.parametrize(('version', 'names'), [(5, NAMES), (4, {'one'}), (4, {*NAMES, 'three'})])
 def test_another_format_or_other_arrays_are_refused(file, version, names):
     with pytest.raises(
-            ArchiveError, match=f'file: not a thing, expected a thing file of format {version}'):
-        read_archive(file, 'thing', version, names)
+            files.ArchiveError,
+            match=f'file: not a thing, expected a thing file of format {version}'):
+        files.read_archive(file, 'thing', version, names)
 
 
 @pytest.mark.parametrize('about', [json.dumps([1]), json.dumps({})])
 def test_a_description_of_another_kind_is_refused(tmp_path, about):
     np.savez(tmp_path / 'file.npz', one=1, two=2, about=about)
-    with pytest.raises(ArchiveError, match='not a thing'):
-        read_archive(tmp_path / 'file.npz', 'thing', 4, NAMES)
+    with pytest.raises(files.ArchiveError, match='not a thing'):
+        files.read_archive(tmp_path / 'file.npz', 'thing', 4, NAMES)
 
 
-@pytest.mark.parametrize('read', [read_yaml, read_arrays])
+@pytest.mark.parametrize('read', [files.read_yaml, files.read_arrays])
 def test_the_error_of_a_missing_file_names_it_once(tmp_path, read):
     path = tmp_path / 'missing'
     with pytest.raises(ValueError, match=f'^{path}: cannot be read: No such file or directory$'):
@@ -126,8 +117,8 @@ def test_a_flipped_bit_is_an_error_or_changes_no_content(file):
         damaged[place] ^= 1
         file.write_bytes(damaged)
         try:
-            arrays, about = read_archive(file, 'thing', 4, NAMES)
-        except ArchiveError:
+            arrays, about = files.read_archive(file, 'thing', 4, NAMES)
+        except files.ArchiveError:
             n_errors += 1
         else:
             # The format repeats a part of its headers, and does not protect the time of writing.
@@ -140,8 +131,8 @@ def test_a_flipped_bit_is_an_error_or_changes_no_content(file):
 def test_a_file_of_another_format_is_named(tmp_path, content):
     """NumPy would take it for pickled objects, and propose to execute them."""
     (tmp_path / 'a.npz').write_bytes(content)
-    with pytest.raises(ArchiveError, match='cannot be read: no arrays, expected .* .npz'):
-        read_arrays(tmp_path / 'a.npz')
+    with pytest.raises(files.ArchiveError, match='cannot be read: no arrays, expected .* .npz'):
+        files.read_arrays(tmp_path / 'a.npz')
 
 
 @pytest.mark.parametrize('compression', [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA])
@@ -153,15 +144,15 @@ def test_damaged_compressed_arrays_are_an_error(tmp_path, compression):
     content = path.read_bytes()
     for place in range(40, len(content) // 2, 3):
         path.write_bytes(content[:place] + bytes([content[place] ^ 255]) + content[place + 1:])
-        with pytest.raises(ArchiveError, match='cannot be read'):
-            read_arrays(path)
+        with pytest.raises(files.ArchiveError, match='cannot be read'):
+            files.read_arrays(path)
 
 
 @pytest.mark.parametrize(('text', 'value'), [
     ('3', 3), ('-3', -3), ('+3', 3), ('0', 0), ('1.5', 1.5), ('-.5e-3', -0.5e-3), ('1.', 1.0),
     ('2.5e9', 2.5e9), ('0.010', 0.01), ('.inf', float('inf')), ('true', True), ('~', None)])
 def test_numbers_in_yaml_are_decimal(text, value):
-    found = parse_yaml(f'[{text}, {{a: {text}}}]')
+    found = files.parse_yaml(f'[{text}, {{a: {text}}}]')
     assert found == [value, {'a': value}]
     assert type(found[0]) is type(value)
 
@@ -171,7 +162,7 @@ def test_numbers_in_yaml_are_decimal(text, value):
     '28e9'])
 def test_other_notations_in_yaml_are_text(text):
     """YAML 1.1 reads 010 as 8, and -1:30 as -90."""
-    assert parse_yaml(f'[{text}]') == [text]
+    assert files.parse_yaml(f'[{text}]') == [text]
 
 
 @pytest.mark.parametrize(('text', 'error'), [
@@ -182,4 +173,4 @@ def test_other_notations_in_yaml_are_text(text):
 def test_a_key_that_yaml_repeats_is_an_error(tmp_path, text, error):
     (tmp_path / 'a.yaml').write_text(text)
     with pytest.raises(ValueError, match=f'a.yaml: cannot be read: .*{error}'):
-        read_yaml(tmp_path / 'a.yaml')
+        files.read_yaml(tmp_path / 'a.yaml')

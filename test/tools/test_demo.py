@@ -15,15 +15,6 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.recording import read_networks
 from rhs_isac_ros.ros.roster import FOLLOWING, ROSTER
 from rhs_isac_ros.tools import demo
-from rhs_isac_ros.tools.demo import (
-    SiteObserver,
-    load_files,
-    main,
-    site_lines,
-    start_network,
-    summary,
-    table,
-)
 
 SITE = Path(__file__).parents[2] / 'config' / 'site.yaml'
 
@@ -51,7 +42,7 @@ def test_a_signal_during_the_start_completes_the_recording(
             (demo, 'start_network', interrupted), (demo, 'private_domain', dict)):
         monkeypatch.setattr(module, name, replacement)
     monkeypatch.chdir(tmp_path)
-    assert main(['--record', 'run.mcap', *arguments]) == 0
+    assert demo.main(['--record', 'run.mcap', *arguments]) == 0
     assert [file.name for file in tmp_path.iterdir()] == ['run.mcap']
     assert [*read_networks('run.mcap').surfaces] == surfaces
 
@@ -62,12 +53,12 @@ def test_a_recording_that_fails_has_an_exit_code(tmp_path, monkeypatch, capsys, 
     monkeypatch.setattr(demo, 'private_domain', dict)
     monkeypatch.chdir(tmp_path)
     with full_disk(10):
-        assert main(['--record', 'run.mcap']) == 1
+        assert demo.main(['--record', 'run.mcap']) == 1
     out, err = capsys.readouterr()
     assert (out, err) == ('', 'demo: error: run.mcap.part: cannot be written: File too large; the '
                               'recording ends after 0 messages\n')
     # The same command again would replace the file.
-    assert main(['--record', 'run.mcap']) == 2
+    assert demo.main(['--record', 'run.mcap']) == 2
     assert 'run.mcap.part: cannot be written: File exists' in capsys.readouterr().err
 
 
@@ -85,7 +76,7 @@ def test_samples_that_cannot_be_written_have_an_exit_code(tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     lab = [f'--{name}={SITE.parent}/{file}' for name, file in (
         ('config', 'lab.yaml'), ('codebook', 'codebook_lab.yaml'))]
-    assert main([*lab, '--radio', 'waveform', '--samples', 'samples']) == 1
+    assert demo.main([*lab, '--radio', 'waveform', '--samples', 'samples']) == 1
     assert capsys.readouterr().err == f'demo: error: {error}\n'
 
 
@@ -95,7 +86,7 @@ def test_samples_that_cannot_be_written_have_an_exit_code(tmp_path, monkeypatch,
     ('table1.yaml', 'codebook_crlb.yaml', 'codebook_crlb.yaml')])
 def test_the_default_codebook_lies_beside_the_scenario(config, codebook, expected):
     config, codebook = (name and SITE.parent / name for name in (config, codebook))
-    assert load_files(config, codebook)[1].samefile(SITE.parent / expected)
+    assert demo.load_files(config, codebook)[1].samefile(SITE.parent / expected)
 
 
 @pytest.mark.parametrize(('speed_mps', 'declared_mps', 'lines'), [
@@ -104,7 +95,7 @@ def test_undeclared_movement_is_one_line(speed_mps, declared_mps, lines, tmp_pat
     path = tmp_path / 'mine.yaml'
     path.write_text(f'frame_duration_s: 0.015\nmax_user_speed_mps: {speed_mps}\n'
                     f'user_speed_std_mps: {declared_mps}\n')
-    load_files(path, None)
+    demo.load_files(path, None)
     found = capsys.readouterr().err.splitlines()
     assert [line.partition(',')[0] for line in found] == lines * ['warning: user_speed_std_mps: 0']
 
@@ -118,7 +109,7 @@ class Started(dict):
 
 def test_each_node_has_the_given_parameters_that_it_knows():
     nodes = Started()
-    start_network(nodes, 2, Scenario(), seed=3, rest_s=None, prior='track')
+    demo.start_network(nodes, 2, Scenario(), seed=3, rest_s=None, prior='track')
     assert {name for _, name in nodes} == {*ROSTER, 'user_1', 'user_2'} - {'user'}
     assert nodes['', 'positioner'] == {'prior': 'track'}
     assert nodes['', 'bs'] == {'seed': 3}
@@ -129,14 +120,14 @@ def test_each_node_has_the_given_parameters_that_it_knows():
 
 def test_a_composed_network_has_the_same_parameters_in_one_process():
     nodes = Started()
-    start_network(nodes, 2, Scenario(), composed=True, seed=3, rest_s=None, speed_mps=1.0)
+    demo.start_network(nodes, 2, Scenario(), composed=True, seed=3, rest_s=None, speed_mps=1.0)
     assert nodes == {('', 'network'): {
         'users': 2, 'mobility': 'random_walk', 'seed': 3, 'speed_mps': 1.0}}
 
 
 def test_a_site_has_users_at_the_first_surface_and_one_fusion():
     nodes = Started()
-    start_network(
+    demo.start_network(
         nodes, 30, Scenario(), together=True, surfaces=['front', 'side'], site_file='x.yaml')
     assert {name for space, name in nodes if space == 'front'} == {*ROSTER, 'users'} - {'user'}
     assert {name for space, name in nodes if space == 'side'} == {*FOLLOWING}
@@ -146,12 +137,12 @@ def test_a_site_has_users_at_the_first_surface_and_one_fusion():
 
 
 def test_the_report_has_a_line_for_each_cycle_and_statistics(make_cycles):
-    rows = [row.split() for row in table(make_cycles(3)).splitlines()[2:]]
+    rows = [row.split() for row in demo.table(make_cycles(3)).splitlines()[2:]]
     numbers = ['0.50', '0.20', '10.0', '20.0', '30.0', '40.0', '1.000', '0.000']
     assert [(row[0], row[1], row[8:]) for row in rows] == [
         ('2', '1', numbers), ('3', '2', numbers), ('4', '1', numbers)]
     assert rows[0][2:8] == ['6.00', '2.00', '0.50', '6.30', '2.40', '0.50']
-    assert summary(make_cycles(3), [CycleRecord(9, 4, outcome='user_gone')]).splitlines() == [
+    assert demo.summary(make_cycles(3), [CycleRecord(9, 4, outcome='user_gone')]).splitlines() == [
         '3 cycles of 2 users served, 1 given up; codebooks: 1',
         'position error: median 0.50 m, root mean square 0.50 m; median √CRLB 0.20 m',
         'cycle: median 100.0 ms; estimator: median 10.0 ms',
@@ -161,7 +152,7 @@ def test_the_report_has_a_line_for_each_cycle_and_statistics(make_cycles):
 
 def test_the_report_of_a_site_has_the_errors_of_each_surface_and_the_handovers(
         bench, make_cycles):
-    observer = bench.add(SiteObserver, Site.from_yaml(SITE))
+    observer = bench.add(demo.SiteObserver, Site.from_yaml(SITE))
     for cycle in make_cycles(4, first=1):
         for message in (m.Beacon(cycle_id=cycle.cycle_id, attempt=0), cycle.truth, cycle.signals,
                         cycle.estimate, cycle.capacity, cycle.state):
@@ -174,7 +165,7 @@ def test_the_report_of_a_site_has_the_errors_of_each_surface_and_the_handovers(
         observer._keep('side' if cycle.cycle_id == 4 else 'front', m.Data(
             cycle_id=cycle.cycle_id, user=cycle.user, direction=m.Direction.UPLINK,
             stage=m.Stage.DELIVERED, duration_s=0.1, bits=1.0))
-    text, *lines = site_lines(observer)
+    text, *lines = demo.site_lines(observer)
     assert [row.split() for row in text.splitlines()[2:]] == [
         ['2', '2', '8.00', '1.00', '0.50', '1.000', '2.000', '0.500', 'front'],
         ['3', '1', '10.00', '2.00', '0.50', '1.000', 'nan', '0.500', 'front'],
