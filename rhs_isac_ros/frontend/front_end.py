@@ -14,6 +14,7 @@ from rhs_isac_ros.frontend.sigmf_recording import SampleRecorder
 from rhs_isac_ros.frontend.surface import Surface
 from rhs_isac_ros.model.arrays import numbers
 from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.plugins import calling
 
 
 class FrontEnd:
@@ -59,7 +60,8 @@ class FrontEnd:
 
     def status(self) -> Mapping[str, str]:
         """Return details of the radio for the diagnostics."""
-        return self._radio.modem.status()
+        with calling(f'{type(self._radio).__name__}.modem.status'):
+            return self._radio.modem.status()
 
     def close(self) -> None:
         """Release the surface and the radio, and complete the recording."""

@@ -23,6 +23,7 @@ from rhs_isac_ros.model.arrays import adjoint, numbers
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import Field
+from rhs_isac_ros.support.plugins import PluginError, calling
 
 # Number of tunings among which a focused beam chooses if tunings are continuous.
 _N_TUNINGS = 65
@@ -30,7 +31,7 @@ _N_TUNINGS = 65
 Factor: TypeAlias = np.ndarray | complex
 
 
-class BoardError(ValueError):
+class BoardError(PluginError):
     """A board is unknown or invalid, or does not support what a caller needs."""
 
 
@@ -69,10 +70,10 @@ class Board(abc.ABC):
     is_amplitude: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Let methods raise BoardError if their results have wrong shapes, types or values."""
+        """Check the results of all methods of `Board` that a class outside of this package has."""
         super().__init_subclass__(**options)
-        for name in ('transfer', 'pullback', 'coefficients', 'slopes'):
-            if name in vars(cls):
+        if cls.__module__.partition('.')[0] != __name__.partition('.')[0]:
+            for name in _RESULTS.keys() & vars(cls).keys():
                 setattr(cls, name, _checked(name, vars(cls)[name]))
 
     def __post_init__(self) -> None:
@@ -201,21 +202,35 @@ class Board(abc.ABC):
         return levels[(gains * interference).real.argmax(axis=0)]
 
 
+# Types and axes of the results of methods: B bands, J sub-bands, Q frames, E elements, K feeds.
+_RESULTS: dict[str, tuple[type | None, tuple[str, ...]]] = {
+    'transfer': (None, ('BJQEK',)), 'pullback': (float, ('BQE',)), 'paths': (None, ('BJKE',)),
+    'channels': (None, ('BJQKE',)), 'radiation': (None, ('BJQE',)), 'feeds': (None, ('BJQK',)),
+    'by_tunings': (float, ('BQE',)), 'by_digital': (None, ('BJQK',)), 'focused': (float, ('E',)),
+    'coefficients': (None, ('BJQE', 'B1QE', '1JQE', '11QE')),
+    'slopes': (None, ('BJQE', 'B1QE', '1JQE', '11QE', 'E', ''))}
+
+
 def _checked(name: str, method: Callable[..., Any]) -> Callable[..., np.ndarray]:
-    """Return a method of a board, with a name, that checks its result."""
+    """Return a method of a board, with a name, that checks its result, and raises PluginError."""
+    kind, axes = _RESULTS[name]
+
     @functools.wraps(method)
-    def checked(self: Board, ports: Ports, tunings: np.ndarray, *others: np.ndarray,
-                **named: np.ndarray) -> np.ndarray:
-        found = method(self, ports, tunings, *others, **named)
-        (n_bands, n_subbands), frames = ports.frequencies_hz.shape, tunings.shape[1:]
-        coefficients = [(n, m, *frames) for n in (n_bands, len(tunings)) for m in (n_subbands, 1)]
-        shapes: dict[str, list[tuple[int, ...]]] = {
-            'transfer': [(n_bands, n_subbands, *frames, len(ports.feeds_m))],
-            'pullback': [(n_bands, *frames)],
-            'coefficients': coefficients, 'slopes': [*coefficients, frames[1:], ()]}
-        return numbers(f'{type(self).__name__}.{name}', found,
-                       float if name == 'pullback' else None, BoardError,
-                       shapes=[*dict.fromkeys(shapes[name])])
+    def checked(self: Board, *arguments: Any, **named: Any) -> np.ndarray:
+        with calling(place := f'{type(self).__name__}.{name}'):
+            found = method(self, *arguments, **named)
+        given = dict(zip(('ports', 'tunings', 'other'), arguments, strict=False)) | named
+        ports: Ports = given['ports']
+        arrays = [one for one in given.values() if np.ndim(one) > 2]
+        n_frames = max((one.shape[1 if one.ndim < 4 else 2] for one in arrays), default=0)
+        sizes = dict(zip('BJQEK1', (*ports.frequencies_hz.shape, n_frames, len(ports.elements_m),
+                                    len(ports.feeds_m), 1), strict=True))
+        found = numbers(place, found, kind, BoardError, shapes=[*dict.fromkeys(
+            tuple(sizes[axis] for axis in shape) for shape in axes)])
+        if name == 'focused' and not ((found >= 0) & (found <= 1)).all():
+            raise BoardError(f'{place}: {found.min():g} to {found.max():g}, expected tunings from '
+                             '0 to 1')
+        return found
     return checked
 
 

@@ -31,7 +31,7 @@ def board_of(value: Any) -> Board:
             if name in BUILT_IN:
                 raise BoardError(f'{type(value).__name__}: kind {name!r}, expected another one '
                                  'than that of a built-in board')
-            plugins.GIVEN[key] = type(value)
+            plugins.give(key, type(value))
         return value
     fields = {'kind': value} if isinstance(value, str) else value
     if not isinstance(fields, Mapping) or not isinstance(kind := fields.get('kind'), str):

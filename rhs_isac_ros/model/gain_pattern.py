@@ -25,7 +25,7 @@ _MAX_GAIN = 1e6
 _STEP_RAD = 1e-3
 
 
-class PatternError(ValueError):
+class PatternError(plugins.PluginError):
     """The function of a gain pattern fails, or its result has a wrong shape, type or values."""
 
 

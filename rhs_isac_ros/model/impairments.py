@@ -18,7 +18,7 @@ import enum
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -319,34 +319,26 @@ def impairments_of(scenario: Scenario) -> tuple[Impairment, ...]:
     return (*(one for one in BUILT_IN if one.std(scenario) > 0), *_installed(scenario))
 
 
+@plugins.cached
 def nuisance_of(scenario: Scenario) -> Nuisance:
     """Return the nuisance parameters of all impairments that a scenario declares.
 
     Raises PluginError if an impairment has no valid exponents, covariance or scope.
     """
-    return _nuisance(scenario, _given(scenario))
+    return Nuisance(scenario, [_linear(one, scenario) for one in impairments_of(scenario)])
 
 
-def _given(scenario: Scenario) -> tuple[Any, ...]:
-    """Return objects in place of names; a notebook may define a class of one name again."""
-    return tuple(plugins.GIVEN.get(plugins.key_of(plugins.IMPAIRMENTS, name))
-                 for name, _ in scenario.impairments)
-
-
-@functools.lru_cache(maxsize=16)
-def _nuisance(scenario: Scenario, given: tuple[Any, ...]) -> Nuisance:
-    parts = []
-    for one in impairments_of(scenario):
+def _linear(one: Impairment, scenario: Scenario) -> Linear:
+    with plugins.calling(f'{type(one).__name__}.linear'):
         linear = one.linear(scenario)
-        with translated(ValueError, plugins.PluginError, type(one).__name__):
-            if not isinstance(linear, Linear) or not isinstance(one.scope, Scope):
-                raise ValueError(f'linear: {linear!r}, scope: {one.scope!r}, expected a Linear '
-                                 'and a Scope')
-            patterns = numbers('patterns', linear.patterns, complex,
-                               shapes=[('q', *_shape(scenario))])
-            root = numbers('root', linear.root, shapes=[(len(patterns), len(patterns))])
-        parts.append(linear._replace(patterns=patterns, root=root))
-    return Nuisance(scenario, parts)
+    with translated(ValueError, plugins.PluginError, type(one).__name__):
+        if not isinstance(linear, Linear) or not isinstance(one.scope, Scope):
+            raise ValueError(f'linear: {linear!r}, scope: {one.scope!r}, expected a Linear '
+                             'and a Scope')
+        patterns = numbers('patterns', linear.patterns, complex,
+                           shapes=[('q', *_shape(scenario))])
+        root = numbers('root', linear.root, shapes=[(len(patterns), len(patterns))])
+    return linear._replace(patterns=patterns, root=root)
 
 
 def draw_factors(
@@ -366,14 +358,18 @@ def draw_factors(
     for group in (BUILT_IN, _installed(scenario)):
         for scope, rng in generators.items():
             members = [one for one in group if one.scope is scope]
-            sizes = [len(one.linear(scenario).root) for one in members]
+            sizes = [len(_linear(one, scenario).root) for one in members]
             white = np.split(rng.standard_normal((n, sum(sizes))), np.cumsum(sizes), axis=1)
-            values |= {id(one): numbers(
-                f'{type(one).__name__}.values', one.values(scenario, part),
-                error=plugins.PluginError, shapes=[part.shape])
-                for one, part in zip(members, white, strict=False) if one in declared}
+            values |= {id(one): _values(one, scenario, part)
+                       for one, part in zip(members, white, strict=False) if one in declared}
     return nuisance.factors(
         np.concatenate([values[id(one)] for one in declared], axis=1))
+
+
+def _values(one: Impairment, scenario: Scenario, white: np.ndarray) -> np.ndarray:
+    with plugins.calling(place := f'{type(one).__name__}.values'):
+        values = one.values(scenario, white)
+    return numbers(place, values, error=plugins.PluginError, shapes=[white.shape])
 
 
 def draw_impairments(
@@ -393,10 +389,9 @@ def draw_impairments(
 
 
 def _installed(scenario: Scenario) -> tuple[Impairment, ...]:
-    return tuple(_load(name, strength, given) for (name, strength), given in zip(
-        scenario.impairments, _given(scenario), strict=True))
+    return tuple(_load(name, strength) for name, strength in scenario.impairments)
 
 
-@functools.lru_cache(maxsize=16)
-def _load(name: str, strength: float, given: Any) -> Impairment:
+@plugins.cached
+def _load(name: str, strength: float) -> Impairment:
     return plugins.make(plugins.IMPAIRMENTS, name, Impairment, strength, in_file=True)

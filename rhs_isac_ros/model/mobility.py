@@ -62,12 +62,14 @@ def state_of(mobility: Mobility, now_s: float) -> np.ndarray:
 
     Raises PluginError if the mobility returns anything else.
     """
-    return _vectors(mobility, 'state', mobility.state(now_s))
+    finite('now_s', now_s)
+    with plugins.calling(place := f'{type(mobility).__name__}.state'):
+        found = mobility.state(now_s)
+    return _vectors(place, found)
 
 
-def _vectors(mobility: Mobility, method: str, found: Any) -> np.ndarray:
-    return numbers(f'{type(mobility).__name__}.{method}', found, error=plugins.PluginError,
-                   shapes=[(2, 3)])
+def _vectors(place: str, found: Any) -> np.ndarray:
+    return numbers(place, found, error=plugins.PluginError, shapes=[(2, 3)])
 
 
 class Crowd:
@@ -91,11 +93,11 @@ class Crowd:
         for user in np.flatnonzero(now_s >= self._end_s).tolist():
             mobility = self._mobilities[user]
             if isinstance(mobility, StraightMobility):
-                leg = mobility.leg(now_s)
+                with plugins.calling(place := f'{type(mobility).__name__}.leg'):
+                    leg = mobility.leg(now_s)
                 if not isinstance(leg, Leg) or not leg.departure_s <= now_s < leg.end_s:
-                    raise plugins.PluginError(
-                        f'{type(mobility).__name__}.leg: {leg!r}, expected a Leg at {now_s} s')
-                self._origin[user], self._velocity[user] = _vectors(mobility, 'leg', leg[:2])
+                    raise plugins.PluginError(f'{place}: {leg!r}, expected a Leg at {now_s} s')
+                self._origin[user], self._velocity[user] = _vectors(place, leg[:2])
                 self._departure_s[user], self._end_s[user] = leg[2:]
         velocity = self._velocity.copy()
         position = self._origin + velocity * (now_s - self._departure_s)[:, None]

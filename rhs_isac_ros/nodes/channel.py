@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 from rhs_isac_ros.frontend import Air, FrontEnd, Radio, SampleRecorder, make_radio, make_surface
@@ -75,9 +75,11 @@ class ChannelNode(RoleNode[Channel]):
 
     def report(self) -> Report:
         """Return the diagnostics, with those of the radio."""
+        of_radio: Mapping[str, str] = {}
+        with self.noting():
+            of_radio = self._front_end.status()
         report = super().report()
-        return dataclasses.replace(
-            report, details={**report.details, **self._front_end.status()})
+        return dataclasses.replace(report, details={**report.details, **of_radio})
 
     def stand_by(self) -> None:
         """Release surface and radio after the request in progress."""

@@ -297,11 +297,14 @@ class UserNode(RoleNode[User]):
         if self._robot and self._robot.lack:
             return
         role, now_s, stamp = self.role, self.now_s(), self.get_clock().now().to_msg()
-        truths = role.ground_truths(now_s)
+        with self.noting():
+            self._publish_truths(role.ground_truths(now_s), stamp)
+
+    def _publish_truths(self, truths: m.GroundTruths, stamp: Time) -> None:
         period_s = self.values.ground_truth_period_s
         endpoints.set_period(self._truth_timer, period_s if self._robot or truths.velocity.any()
                              else max(period_s, _REST_S))
-        self.publish(truths if len(role.users) > 1 else next(truths.each()))
+        self.publish(truths if len(self.role.users) > 1 else next(truths.each()))
         for truth in truths.each():
             endpoints.publish_if_subscribed(
                 self._true_odometry.publishers(truth.user), functools.partial(

@@ -12,9 +12,8 @@ from rhs_isac_ros.model.arrays import numbers, position_problem
 from rhs_isac_ros.model.gaussian import symmetric
 from rhs_isac_ros.positioning.mixture import Mixture, with_velocities
 from rhs_isac_ros.positioning.sheets import Sheets
-from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import finite
-from rhs_isac_ros.support.plugins import PluginError
+from rhs_isac_ros.support.plugins import PluginError, calling
 
 # Limit far above any received amplitude [sqrt(W)]. The square of a whitened amplitude is still
 # finite in single precision.
@@ -267,6 +266,11 @@ class Estimate:
             density=self.density and widened, frame=SITE)
 
 
+# Sizes of the numbers in an estimate, apart from its position; see `Estimate`.
+_SIZES: dict[str, tuple[int, ...]] = {
+    'velocity': (3,), 'velocity_covariance': (3, 3), 'cross_covariance': (3, 3), **dict.fromkeys((
+        'residual', 'expected_residual', 'outside_probability', 'blocked_probability',
+        'log_agreement', 'n_phases', 'is_predicted', 'is_elsewhere'), ())}
 # Fields of an estimate that are no numbers.
 _OBJECTS = ('reason', 'density', 'unbounded', 'see')
 
@@ -306,14 +310,17 @@ class Estimator(Protocol):
 def estimate_of(estimator: Estimator, received: np.ndarray) -> Estimate:
     """Return the estimate of an estimator; see `Estimator.estimate`.
 
-    Raises SignalError as the estimator does, and PluginError if it returns anything but an
-    `Estimate` with one position for each shot.
+    Raises SignalError as the estimator does, and PluginError if it raises anything else, or
+    returns anything but an `Estimate` with one position for each shot.
     """
-    with translated(PluginError, PluginError, f'{type(estimator).__name__}.estimate'):
+    with calling(f'{type(estimator).__name__}.estimate', SignalError):
         found = estimator.estimate(received)
         expected = (*np.shape(received)[:-2], 3)
         if not isinstance(found, Estimate) or found.mean.shape != expected:
             raise PluginError(f'{found!r}, expected an Estimate with means {list(expected)}')
+        for name, sizes in _SIZES.items():
+            numbers(name, getattr(found, name), error=PluginError, finite=False,
+                    shapes=[sizes, (*expected[:-1], *sizes)])
     return found
 
 

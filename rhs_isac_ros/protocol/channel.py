@@ -26,6 +26,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.role import REMEMBERED_CYCLES, NewestDict, Role
 from rhs_isac_ros.protocol.settings import Impairments, PendingSettings
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.plugins import trace_of
 
 # Number of users whose multipath is kept. With more users, the time between two cycles of a user
 # usually far exceeds the coherence time.
@@ -154,11 +155,13 @@ def apply_patterns(
     except SurfaceFault as fault:
         return events.FrontEndFailed(request.key, f'surface_{fault.kind}', f'surface: {fault}')
     except RadioFault as fault:
-        return events.FrontEndFailed(request.key, 'radio', f'radio: {fault}')
+        return events.FrontEndFailed(
+            request.key, 'radio', f'radio: {fault}', trace_of(fault.__cause__))
     # The surface cannot show such a configuration, or a driver of another package fails.
     except Exception as error:
         kind = type(error).__name__
-        return events.FrontEndFailed(request.key, f'surface_{kind}', f'surface: {kind}: {error}')
+        return events.FrontEndFailed(
+            request.key, f'surface_{kind}', f'surface: {kind}: {error}', trace_of(error))
     return events.PatternsApplied(request.key, feeds)
 
 
@@ -239,7 +242,7 @@ class Channel(Role):
                 del self._applying[event.key]
                 self._fault = event.text
                 self.counters[event.kind] += 1
-                self.log(event.text, warning=True, key=event.kind)
+                self.log(f'{event.text}{event.trace}', warning=True, key=event.kind)
         if self._cycle and isinstance(event, m.Message):
             if isinstance(event, m.Beam | m.RhsConfiguration):
                 # Compute the capacity, which is the same in both directions, before data arrive.
@@ -317,9 +320,9 @@ class Channel(Role):
             elif any(exchange.covers(event, cycle) for exchange in self._applying.values()):
                 self.count(events.Outcome.DUPLICATE)
             elif (configurations := self._configurations_for(event, cycle)) is not None:
+                sounding = self._sounding(event, cycle, configurations)
                 self._applying[key] = _Exchange(event, cycle, configurations)
-                self.act(events.ApplyPatterns(
-                    key, configurations, self._sounding(event, cycle, configurations)))
+                self.act(events.ApplyPatterns(key, configurations, sounding))
             else:
                 continue
             del self._pending[key]

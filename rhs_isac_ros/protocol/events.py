@@ -108,6 +108,7 @@ class FrontEndFailed:
     key: tuple[int, int]
     kind: str  # identifies faults of the same kind, such as ``surface_silence``
     text: str
+    trace: str = dataclasses.field(default='', compare=False)  # of an exception of the driver
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -244,6 +245,8 @@ class Outcome(enum.Enum):
     STALE = 'stale', Kind.DROPPED
     OVERFLOW = 'overflow', Kind.DROPPED
     BEHIND = 'behind', Kind.DROPPED
+    # A plug-in failed while it was used for a message.
+    PLUGIN_FAULT = 'plugin_fault', Kind.DROPPED
 
     RETRY_RHS = 'retry_rhs', Kind.REPEATED
     RETRY_BAND = 'retry_band', Kind.REPEATED

@@ -34,7 +34,7 @@ from rhs_isac_ros.protocol.fusion import posterior_of
 from rhs_isac_ros.protocol.role import CodebookCache, NewestDict, Role
 from rhs_isac_ros.protocol.settings import TRACK, PendingSettings, PositionerSettings
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
-from rhs_isac_ros.support.plugins import PluginError
+from rhs_isac_ros.support.plugins import PluginError, calling
 from rhs_isac_ros.support.texts import MAX_LISTED, counted
 from rhs_isac_ros.system import System
 
@@ -97,7 +97,8 @@ class Tracks:
         if track is None or not track.may_continue(received, now_s):
             track = _Track(Tracker(estimator, Motion(speed_mps)), received, now_s)
         track.tracker.estimator = estimator
-        estimate = track.tracker.update(now_s, signals)
+        with calling(type(estimator).__name__, SignalError):
+            estimate = track.tracker.update(now_s, signals)
         self.posterior = track.tracker.latest
         if estimate.fix:
             track.interval_s = now_s - track.time_s
@@ -277,10 +278,13 @@ class Positioner(Role):
                     self.log(self._settings.apply())
             case EstimatorBuilt(codebook, estimator, elapsed_s, failure):
                 job = self._building or _Job(codebook, self._settings.latest)
-                if estimator is None:
-                    self._revert(job, failure)
-                else:
-                    self._keep(job, estimator, elapsed_s)
+                try:
+                    if estimator is None:
+                        self._revert(job, failure)
+                    else:
+                        self._keep(job, estimator, elapsed_s)
+                except PluginError as error:
+                    self._revert(job, str(error))
                 self._continue()
             case m.ReceivedSignals():
                 self._receive(event, self.now_s)
@@ -310,7 +314,9 @@ class Positioner(Role):
 
     def _put(self, job: _Job, estimator: Estimator) -> System:
         """Store an estimator, and return its system, which a plug-in need not have."""
-        system = getattr(estimator, 'system', None) or System(self._scenario, job.codebook)
+        system = getattr(estimator, 'system', None)
+        if not isinstance(system, System):
+            system = System(self._scenario, job.codebook)
         system.prepare()
         self._estimators.put(job.codebook.id, _Built(job, system, estimator))
         return system
@@ -364,24 +370,25 @@ class Positioner(Role):
 
     def _locate(self, received: m.ReceivedSignals, now_s: float) -> None:
         job, system, estimator = self._estimators.take(received.codebook_id)
-        begin = self._stopwatch()
+        begin, problem, crlb_m2 = self._stopwatch(), '', np.nan
         try:
             estimate = self._estimate(received, job.settings, estimator, now_s)
-        # A plug-in may return anything.
+            latency_s = self._stopwatch() - begin
+            if estimate.fix and not (problem := position_problem(estimate.mean)):
+                crlb_m2 = float(system.crlb(estimate.mean[None])[0])
         except (SignalError, PluginError) as error:
+            if error.__cause__ and isinstance(error, PluginError):
+                self.act(self.noted(error))
             self._no_fix(received, str(error))
             return
-        latency_s = self._stopwatch() - begin
-        problem = position_problem(np.asarray(estimate.mean)) if estimate.fix else ''
         probabilities = {f'{name}_probability': value
                          for name, value in probabilities_of(estimate).items()}
         if estimate.fix and not problem:
             of_site = estimate.to_site(self._scenario.pose)
             self.send(m.derive(
                 m.PositionEstimate, received, stamp_ns=received.stamp_ns,
-                position=of_site.mean, covariance_m2=of_site.covariance,
-                crlb_m2=float(system.crlb(estimate.mean[None])[0]), estimator=estimator.name,
-                latency_s=latency_s, **probabilities, **proposal(
+                position=of_site.mean, covariance_m2=of_site.covariance, crlb_m2=crlb_m2,
+                estimator=estimator.name, latency_s=latency_s, **probabilities, **proposal(
                     self._library, self._tracks.predict(received.user)
                     if self._library.by_id and estimate.n_phases else None)))
             self._publish_track(received, of_site)
@@ -403,7 +410,8 @@ class Positioner(Role):
                 received, estimator, settings.track_speed_mps, received.time_s(now_s))
         self._tracks.clear()
         if self._is_observed() and isinstance(estimator, SearchEstimator):
-            return estimator.posterior(received.stacked)
+            with calling(f'{type(estimator).__name__}.posterior', SignalError):
+                return estimator.posterior(received.stacked)
         return estimate_of(estimator, received.stacked)
 
     def _publish_track(self, received: m.ReceivedSignals, estimate: Estimate) -> None:

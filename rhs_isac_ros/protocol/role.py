@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 from rhs_isac_ros.protocol.events import Action, Event, Immediately, LogMessage, Outcome, Send
 from rhs_isac_ros.protocol.messages import Message
 from rhs_isac_ros.support.fields import finite
+from rhs_isac_ros.support.plugins import PluginError, trace_of
 
 
 class Role:
@@ -38,11 +39,21 @@ class Role:
     def handle(self, event: Event, now_s: float) -> list[Action]:
         """Process an event at `now_s` [s] on a monotonic clock; return the actions in order.
 
-        Raises ValueError if the time is not finite.
+        If a plug-in fails, the event has no further effect, as if it had been lost. Raises
+        ValueError if the time is not finite.
         """
         self.now_s, self._actions = finite('now_s', now_s), []
-        self.react(event)
+        try:
+            self.react(event)
+        except PluginError as error:
+            self.act(self.noted(error))
         return self._actions
+
+    def noted(self, error: PluginError) -> Action:
+        """Count a failure of a plug-in, and return an action that logs it with its traceback."""
+        self.count(Outcome.PLUGIN_FAULT)
+        return LogMessage(f'plug-in: {error}{trace_of(error.__cause__)}', warning=True,
+                          key=f'plug-in: {error}')
 
     def react(self, event: Event) -> None:
         """Process an event at the time `now_s`."""

@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.srv import GetParameters
@@ -29,6 +29,7 @@ from rhs_isac_ros.ros.roster import MEMBERS
 from rhs_isac_ros.ros.topics import Frame
 from rhs_isac_ros.support.errors import translated
 from rhs_isac_ros.support.fields import ParameterError
+from rhs_isac_ros.support.plugins import PluginError
 
 _NAMES = list(CODEBOOK)
 # Time without a response after which a request is repeated [s]: a killed optimizer does not
@@ -389,6 +390,14 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
                 self.revert_parameters(settings)
             case _:
                 self.execute(action)
+
+    @contextlib.contextmanager
+    def noting(self) -> Iterator[None]:
+        """Note a failure of a plug-in in a block, as the role does when it handles an event."""
+        try:
+            yield
+        except PluginError as error:
+            self._perform(self.role.noted(error))
 
     def _on_timer(self) -> None:
         self._timer.cancel()

@@ -4,11 +4,15 @@ The name of a plug-in is that of an entry point, or ``module:name``. An object t
 in place of a name also has such a name, under which this process finds it again.
 """
 
+import contextlib
+import functools
 import sys
+import traceback
 import weakref
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from operator import attrgetter
-from typing import Any
+from typing import Any, TypeVar
 
 # Groups of entry points; the page `extending` of the documentation specifies their objects.
 IMPAIRMENTS = 'rhs_isac_ros.impairments'
@@ -22,6 +26,28 @@ RADIOS = 'rhs_isac_ros.radios'
 
 class PluginError(ValueError):
     """A plug-in is not installed, cannot be loaded, or does not have the required interface."""
+
+
+def trace_of(error: BaseException | None) -> str:
+    """Return lines with the traceback of an error, which continue a text; '' if there is none."""
+    return '\n' + ''.join(traceback.format_exception(error)).rstrip() if error else ''
+
+
+@contextlib.contextmanager
+def calling(place: object, *kept: type[Exception]) -> Iterator[None]:
+    """Let a block that calls a plug-in, which may raise anything, only raise PluginError.
+
+    The text of the error begins with `place`, and its cause is what the plug-in raised. Exceptions
+    of the `kept` kinds, which belong to the interface of the plug-in, do not change.
+    """
+    try:
+        yield
+    except kept:
+        raise
+    except PluginError as error:
+        raise type(error)(f'{place}: {error}') from error.__cause__
+    except Exception as error:
+        raise PluginError(f'{place}: {type(error).__name__}: {error}') from error
 
 
 def _entry_points(**chosen: str) -> Any:
@@ -44,11 +70,32 @@ def describe(group: str, name: Any) -> str:
         for point in _entry_points(group=group, name=name)))
 
 
-#: Objects that callers have given in place of names, and loaded ones; see `key_of`.
+#: Objects that callers have given in place of names (see `give`), and loaded ones; see `key_of`.
 GIVEN: dict[tuple[str, str], Any] = {}
 LOADED: dict[tuple[str, str], Any] = {}
 #: Objects without a name that scenarios of this process contain, by their texts.
 HELD: weakref.WeakValueDictionary[str, Any] = weakref.WeakValueDictionary()
+# Functions that clear the caches of `cached`.
+_CLEAR: list[Callable[[], None]] = []
+_Function = TypeVar('_Function', bound=Callable[..., Any])
+
+
+def cached(function: _Function, maxsize: int = 16) -> _Function:
+    """Return a function with a cache of its last results, which use objects of plug-ins by name.
+
+    Another object that takes a name, as a class that a notebook defines again, clears the cache.
+    """
+    made: Any = functools.lru_cache(maxsize)(function)
+    _CLEAR.append(made.cache_clear)
+    return made
+
+
+def give(key: tuple[str, str], plugin: Any) -> None:
+    """Let a name refer to an object; `key` is that of `key_of`."""
+    if GIVEN.get(key) is not plugin:
+        GIVEN[key] = plugin
+        for clear in _CLEAR:
+            clear()
 
 
 def key_of(group: str, name: str) -> tuple[str, str]:
@@ -69,7 +116,7 @@ def name_of(plugin: Any) -> str:
         raise PluginError(f'{plugin!r}, expected a name, a class or a callable')
     name = (f'{getattr(plugin, "__module__", "?")}:'
             f'{getattr(plugin, "__qualname__", type(plugin).__qualname__)}')
-    GIVEN[key_of('', name)] = plugin
+    give(key_of('', name), plugin)
     return name
 
 
@@ -116,12 +163,8 @@ def make(group: str, plugin: Any, kind: type, /, *arguments: Any, in_file: bool 
     PluginError if the object cannot be loaded, the call fails, or the result is of another kind.
     """
     factory = load(group, plugin, kind if in_file else None)
-    try:
+    with calling(f'{describe(group, plugin)}: failed'):
         made = factory(*arguments, **options)
-    # The call may raise any exception. Nodes show no traceback, so the message names the plug-in.
-    except Exception as error:
-        raise PluginError(
-            f'{describe(group, plugin)}: failed: {type(error).__name__}: {error}') from error
     if not isinstance(made, kind):
         members = sorted({*dir(kind), *getattr(kind, '__annotations__', ())})
         listed = ', '.join(member for member in members if not member.startswith('_'))

@@ -7,7 +7,7 @@ import pytest
 
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import Impairment, Linear, Scenario, mobility
-from rhs_isac_ros.model.board import Board
+from rhs_isac_ros.model.board import Board, BoardError
 from rhs_isac_ros.model.elementwise import Elementwise
 from rhs_isac_ros.model.gain_pattern import GainPattern
 from rhs_isac_ros.model.surface import ports_of
@@ -27,9 +27,10 @@ WRONG = {
 
 
 def own(base, **results):
-    """Return a class whose methods return these results."""
+    """Return a class whose methods return these results, or those of these functions."""
     return type('Own', base, {'kind': 'own', '__init__': lambda self, *_: None, **{
-        name: lambda *_, result=result: result for name, result in results.items()}})
+        name: lambda *_, result=result: result() if callable(result) else result
+        for name, result in results.items()}})
 
 
 def board(base, name, result):
@@ -39,7 +40,8 @@ def board(base, name, result):
 
 def sample(**parts):
     """Sample signals with an impairment."""
-    linear = Linear(parts.get('patterns', np.ones((1, 2, 6))), parts.get('root', np.eye(1)))
+    linear = parts.get('linear') or Linear(
+        parts.get('patterns', np.ones((1, 2, 6))), parts.get('root', np.eye(1)))
     kind = own((Impairment,), linear=linear, values=parts.get('values', np.zeros((1, 1))))
     scenario = Scenario(**SIZES, impairments={kind: 1.0})
     return System(scenario, CODEBOOK).sample([[8.0, 0, 0]], np.random.default_rng(0))
@@ -61,6 +63,13 @@ RESULTS = {
     'Own.coefficients': (
         np.ones((2, 1, 2, 16)), lambda x: board(Elementwise, 'coefficients', x)),
     'Own.slopes': (np.ones((2, 3, 2, 16)), lambda x: board(Elementwise, 'slopes', x)),
+    'Own.paths': (np.ones((2, 3, 3, 16)), lambda x: board(Board, 'paths', x)),
+    'Own.channels': (np.ones((2, 3, 2, 3, 16)), lambda x: board(Board, 'channels', x)),
+    'Own.radiation': (np.ones((2, 3, 2, 16)), lambda x: board(Elementwise, 'radiation', x)),
+    'Own.feeds': (np.ones((2, 3, 2, 3)), lambda x: board(Elementwise, 'feeds', x)),
+    'Own.by_tunings': (np.ones((2, 2, 16)), lambda x: board(Board, 'by_tunings', x)),
+    'Own.by_digital': (np.ones((2, 3, 2, 3)), lambda x: board(Board, 'by_digital', x)),
+    'Own.focused': (np.ones(16), lambda x: board(Elementwise, 'focused', x)),
     'Own: patterns': (np.ones((1, 2, 6)), lambda x: sample(patterns=x)),
     'Own: root': (np.eye(1), lambda x: sample(root=x)),
     'Own.values': (np.zeros((1, 1)), lambda x: sample(values=x)),
@@ -73,6 +82,32 @@ RESULTS = {
 # What is valid: signals on further axes, and positions that are not known.
 VALID = {'signals': {'another axis', 'not finite'}, 'mean': {'not finite'},
          'covariance': {'not finite'}}
+
+
+@pytest.mark.parametrize(('name', 'use'), [
+    *((name, use) for name, (_, use) in RESULTS.items() if name.startswith('Own.')
+      and name != 'Own.leg'), ('Own.leg', lambda x: move(state=None, leg=x)),
+    ('Own.linear', lambda x: sample(linear=x)),
+    ('Own.estimate', lambda x: estimate_of(own((), estimate=x)(), np.ones((2, 6))))])
+def test_what_a_method_raises_is_the_cause_of_an_error_that_names_it(name, use):
+    def fail():
+        raise KeyError('boom')
+    with pytest.raises(plugins.PluginError, match=f"^{name}: KeyError: 'boom'$") as caught:
+        use(fail)
+    assert "raise KeyError('boom')" in plugins.trace_of(caught.value.__cause__)
+
+
+def test_tunings_of_a_focused_beam_are_from_0_to_1():
+    with pytest.raises(BoardError, match='^Own.focused: -1 to -1, expected tunings from 0 to 1'):
+        board(Elementwise, 'focused', -np.ones(16))
+
+
+@pytest.mark.parametrize('name', ['velocity', 'residual', 'is_predicted', 'cross_covariance'])
+def test_numbers_of_an_estimate_have_the_sizes_of_its_positions(name):
+    for wrong in ('x', np.ones(2), None):
+        found = Estimate(np.ones(3), np.eye(3), **{name: wrong})
+        with pytest.raises(plugins.PluginError, match=f'^Own.estimate: {name}: .*expected'):
+            estimate_of(own((), estimate=found)(), np.ones((2, 6)))
 
 
 @pytest.mark.parametrize(('n', 'found'), [

@@ -255,6 +255,30 @@ def test_without_a_fix_the_positioner_reports_the_reason(
     assert positioner.handle(signals, 0.0) == [send]
 
 
+def test_a_plug_in_that_fails_is_the_reason_and_its_traceback_is_logged(
+        positioner, codebooks, example, offer):
+    def estimate(received):
+        return {}['gain']
+    offer(0)
+    positioner.handle(ready(codebooks[0], estimate), 0.0)
+    signals = example(m.ReceivedSignals, cycle_id=9, user=2, codebook_id=codebooks[0].id)
+    traced, send, _ = positioner.handle(signals, 0.0)
+    assert send.message.reason == "Fixed.estimate: KeyError: 'gain'"
+    assert traced.text.startswith(f'plug-in: {send.message.reason}\nTraceback ')
+    assert "return {}['gain']" in traced.text and traced.warning
+    assert positioner.counters == {'no_fix': 1, 'plugin_fault': 1}
+
+
+def test_an_estimator_without_a_usable_system_is_built_nevertheless(
+        positioner, codebooks, example, offer):
+    offer(0)
+    event = ready(codebooks[0])
+    event.estimator.system = 'the one in the lab'
+    positioner.handle(event, 0.0)
+    signals = example(m.ReceivedSignals, cycle_id=9, user=2, codebook_id=codebooks[0].id)
+    assert isinstance(positioner.handle(signals, 0.0)[0].message, m.PositionEstimate)
+
+
 @pytest.mark.parametrize('error', [ValueError('bad model'), OSError('disk full'), MemoryError()])
 def test_an_error_while_an_estimator_is_built_is_an_event(codebooks, error):
     def make(codebook):

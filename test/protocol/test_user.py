@@ -194,3 +194,17 @@ def test_the_true_positions_of_all_users_of_a_node(users):
     assert truths.cycle_id == 0
     assert [(truth.user, *truth.position, *truth.velocity) for truth in truths.each()] == [
         (user, user, 0, 0, 0, 0, 0) for user in (4, 5, 6)]
+
+
+def test_a_mobility_that_fails_has_the_effect_of_a_lost_grant():
+    class Lost:
+        def state(self, now_s):
+            raise RuntimeError('no map')
+    user = User({4: Lost()}, ONE_FRAME, step_s=2.0, beacon_s=math.inf)
+    for event, now_s in ((PeersChanged(()), 0.0), (beacon(), 10.0)):
+        user.handle(event, now_s)
+    (logged,) = user.handle(grant(), 10.5)
+    assert logged.text.startswith('plug-in: Lost.state: RuntimeError: no map\nTraceback')
+    assert (user.state, user.counters) == (ACKNOWLEDGED, {'plugin_fault': 1})
+    user.handle(Timeout(), 12.0)
+    assert user.state == LISTENING

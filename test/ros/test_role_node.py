@@ -14,6 +14,7 @@ from rhs_isac_ros.protocol.events import LogMessage, Send, Timeout
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import role_node
 from rhs_isac_ros.ros.role_node import Clocks, RoleNode
+from rhs_isac_ros.support import plugins
 
 
 class Scripted(Role):
@@ -114,6 +115,21 @@ def test_log_messages_are_logged_with_their_severity(bench, start, capfd):
             'information', 'a warning', 'a state', 'its end'), strict=True):
         assert f'[{severity}]' in line
         assert line.endswith(f'[scripted]: {text}')
+
+
+def test_a_node_survives_a_plug_in_that_fails_and_logs_its_traceback(bench, start, capfd):
+    class Failing(Role):
+        def react(self, event):
+            with plugins.calling('Grid.estimate'):
+                raise KeyError(event.key)
+    node = start(bench, role := Failing())
+    node.dispatch(LogMessage('', key='gain'))
+    with node.noting():
+        raise plugins.PluginError('Circle.state: nothing')
+    assert role.counters == {'plugin_fault': 2}
+    log = capfd.readouterr().err
+    assert "plug-in: Grid.estimate: KeyError: 'gain'\nTraceback" in log
+    assert 'raise KeyError(event.key)' in log and 'plug-in: Circle.state: nothing' in log
 
 
 def test_messages_keep_their_order(each_bench, start):
