@@ -29,7 +29,7 @@ from rhs_isac_ros.link import capacity_report, choose_beam
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.positioning import Estimator, EstimatorKind, make_estimator
 from rhs_isac_ros.positioning.estimate import estimate_of
-from rhs_isac_ros.support import streams
+from rhs_isac_ros.support import plugins, streams
 from rhs_isac_ros.support.fields import whole
 from rhs_isac_ros.support.jobs import Job, Strand, Workers
 from rhs_isac_ros.system import System
@@ -138,7 +138,7 @@ def evaluate(family: str, scenario: Mapping[str, Any], codebook: Mapping[str, An
     return {name: values.tolist() for name, values in result.items()}
 
 
-@functools.lru_cache(maxsize=1)
+@functools.partial(plugins.cached, maxsize=1)
 def _estimator(name: str, scenario: str, codebook: str) -> Estimator:
     """Return an estimator for a scenario and codebook in JSON; successive jobs share it."""
     return make_estimator(name, Scenario(**json.loads(scenario)),

@@ -81,14 +81,16 @@ def sources_of(*uses: Any) -> str:
     """
     files, texts = set(), []
     for one in uses:
-        # Any other callable may keep a record of its calls.
-        is_plain = isinstance(one, functools.partial | type) or inspect.isfunction(one)
-        texts.append(_definition(one if is_plain else type(one), set()))
+        texts.append(_definition(one, set()))
         while isinstance(one, functools.partial):
             one = one.func
-        # If a module is loaded again, files are read again only if this code differs.
-        texts += [_definition(inspect.unwrap(member).__code__, set()) for member in (
-            vars(one).values() if isinstance(one, type) else [one]) if inspect.isfunction(member)]
+        # If a module is loaded again, files are read again only if this code differs. They do not
+        # contain what an enclosing function binds.
+        texts += [_definition(
+            (inspect.unwrap(member).__code__, inspect.getclosurevars(member).nonlocals)
+            if inspect.isfunction(member) else member, set()) for name, member in (
+                vars(one).items() if isinstance(one, type) else [('', one)])
+            if inspect.isfunction(member) or name[:1] not in ('', '_')]
         module = sys.modules.get(getattr(one, '__module__', ''))
         named = vars(module).values() if module else ()
         modules = [module, *(
@@ -162,20 +164,39 @@ def _digest(*files: str, text: str) -> str:
     return whole.hexdigest()[:16]
 
 
+def _code_of(module: types.ModuleType) -> str:
+    """Return a digest of the functions and classes of a module as this process has loaded them."""
+    own = {name: value for name, value in vars(module).items()
+           if getattr(value, '__module__', '') == module.__name__}
+    codes = {f'{name}.{inner}': inspect.unwrap(one).__code__ for name, value in own.items()
+             for inner, one in (vars(value).items() if isinstance(value, type) else [('', value)])
+             if inspect.isfunction(one)}
+    return hashlib.sha256(json.dumps(_definition(codes, set())).encode()).hexdigest()[:16]
+
+
 @one_blas_thread
 def attempt(function: Function, job: Job,
-            given: Mapping[tuple[str, str], Any] = MappingProxyType({})) -> JobResult:
+            given: Mapping[tuple[str, str], Any] = MappingProxyType({}),
+            modules: Mapping[str, str] = MappingProxyType({})) -> JobResult:
     """Run a job in this process; return errors as text, because some errors cannot be pickled.
 
     `given` are objects of the process that wants the result, to which names of plug-ins refer, by
-    `plugins.key_of`.
+    `plugins.key_of`, and `modules` the digests of modules by their names. A worker of a cluster
+    may have loaded a module before it was edited.
     """
-    plugins.GIVEN.update(
-        (key, one) for key, one in given.items() if key[1] not in plugins.HELD)
+    for key, one in given.items():
+        known = plugins.GIVEN.get(key)
+        # A function arrives as another object with each job.
+        if key[1] not in plugins.HELD and (known is None or sources_of(known) != sources_of(one)):
+            plugins.give(key, one)
     try:
         result = function(**job.arguments)
         if not isinstance(result, Mapping):
             raise TypeError(f'{result!r}, expected a mapping as the result')
+        for name, digest in modules.items():
+            if name in sys.modules and _code_of(sys.modules[name]) != digest:
+                return JobResult(error=f'the worker has another version of the module {name}; '
+                                       'restart the workers')
         return JobResult(json.dumps(as_json(result)), sources=sources_of())
     except MissingLibraryError as error:
         return JobResult(error=str(error))
@@ -282,7 +303,7 @@ class Workers:
                               else contextlib.nullcontext()):
                             future = executor.submit(
                                 _attempt_on_cluster if self.dask else attempt, entry.function,
-                                entry.job, entry.given)
+                                entry.job, entry.given, entry.modules)
                     except Exception as error:
                         raise _failure(entry.job, error) from error
                     running[future], has_started = entry, True
@@ -355,6 +376,9 @@ class _Entry:
     record: Mapping[str, Any]  # What the result depends on.
     # Objects of this process to which names in the arguments refer.
     given: Mapping[tuple[str, str], Any]
+    # Digests of the modules of the function and of plug-ins, by name, if other processes import
+    # them.
+    modules: Mapping[str, str]
     result: dict[str, Any] | None = None
     waiting: list[int] = dataclasses.field(default_factory=list)
 
@@ -419,7 +443,11 @@ class _State:
                 raise ValueError(f'jobs: two have the name {job.name}, expected unique names')
             return known
         entry = self.entries[job.name] = _Entry(function, job, record, {
-            key: plugin for key, plugin in used.items() if key in given})
+            key: plugin for key, plugin in used.items() if key in given}, {
+            name: _code_of(sys.modules[name]) for name in {
+                str(getattr(one, '__module__', '')) for one in (function, *used.values())}
+            if name not in ('__main__', '') and hasattr(sys.modules.get(name), '__file__')
+            and not name.startswith(f'{plugins.__name__.partition(".")[0]}.')})
         if self._folder:
             self._files.add(file := _file(self._folder, job))
             entry.result = _stored(file, record)
@@ -465,7 +493,8 @@ class _AbandonedError(BaseException):
 
 
 def _attempt_on_cluster(
-        function: Function, job: Job, given: Mapping[tuple[str, str], Any]) -> JobResult:
+        function: Function, job: Job, given: Mapping[tuple[str, str], Any],
+        modules: Mapping[str, str]) -> JobResult:
     """Run a job on a worker of a Dask cluster; end it if its client has ended.
 
     Dask itself only forgets such a job, which would occupy the worker until its end.
@@ -486,7 +515,7 @@ def _attempt_on_cluster(
 
     threading.Thread(target=watch, daemon=True).start()
     try:
-        return attempt(function, job, given)
+        return attempt(function, job, given, modules)
     finally:
         with lock:
             over.set()

@@ -136,3 +136,31 @@ def test_objects_of_a_scenario_reach_other_processes(tmp_path):
                   ['crlb', 'rmse'], n_positions=4)
     here, there = (run_sweep(sweep, tmp_path / str(n), n_jobs=n) for n in (1, 2))
     assert here == there
+
+
+def test_an_estimator_that_is_defined_again_takes_its_name(tmp_path):
+    def define(bound, member, attribute):
+        class Own:
+            name, shift = 'own', member
+
+            def __init__(self, scenario, codebook):
+                self.centre = np.array(scenario.roi_center_m)
+
+            def estimate(self, received):
+                mean = self.centre + bound + self.shift + attribute
+                return Estimate(np.tile(mean, (len(received), 1)),
+                                np.tile(np.eye(3), (len(received), 1, 1)))
+
+        class Maker:
+            def __init__(self, attribute):
+                self.attribute = attribute
+
+            def __call__(self, scenario, codebook):
+                return Own(scenario, codebook)
+        return Maker(attribute) if attribute else Own
+    base, values = Scenario(**SMALL), []
+    for shifts in ((0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3), (0, 0, 4)):
+        settings = settings_of(base, [parse_axis('n_frames=1')], 'random', define(*shifts))
+        (point,) = run_sweep(Sweep(base, settings, ['rmse'], n_positions=4), tmp_path, n_jobs=1)
+        values.append(point.interval[0])
+    assert len({*values}) == 5

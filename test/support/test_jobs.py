@@ -79,6 +79,10 @@ class Worker:
     def __init__(self, fails_at=None, error=None):
         self.seen, self._fails_at, self._error = [], fails_at, error
 
+    def __repr__(self):
+        """Return a text without the record, which is no source of a result."""
+        return 'a worker'
+
     def __call__(self, number, of):
         if number == self._fails_at:
             raise self._error
@@ -218,10 +222,34 @@ def test_values_bound_to_a_function_are_sources():
         def work():
             return {'value': value}
         return work
-    for wrap in (of, lambda value: functools.partial(print, end=value)):
+
+    class Work:
+        def __init__(self, value):
+            self.value = value
+
+        def __call__(self):
+            return {'value': self.value}
+    for wrap in (of, lambda value: functools.partial(print, end=value), Work):
         one, other, same = (jobs_module.sources_of(wrap(value)) for value in (
             np.arange(2000), np.arange(1, 2001), np.arange(2000)))
         assert one == same != other
+
+
+def test_a_worker_with_a_module_from_before_an_edit_is_an_error(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, 'dont_write_bytecode', True)
+    monkeypatch.syspath_prepend(tmp_path)
+    digests, ends = [], []
+    for text in ('1', '2'):
+        (tmp_path / 'old_lab.py').write_text(f'class Grid:\n    def n(self): return {text}\n')
+        monkeypatch.delitem(sys.modules, 'old_lab', raising=False)
+        importlib.invalidate_caches()
+        digests.append(jobs_module._code_of(importlib.import_module('old_lab')))
+        ends += [jobs_module.attempt(
+            lambda: {'n': load(ESTIMATORS, 'old_lab:Grid')().n()}, Job('a', {}),
+            modules={'old_lab': digest}) for digest in digests]
+    assert [bool(end.error) for end in ends] == [False, True, False]
+    assert ends[1].error == (
+        'the worker has another version of the module old_lab; restart the workers')
 
 
 @pytest.mark.parametrize('name', ['', 'a/b', '../a', '/a'])
