@@ -16,6 +16,8 @@ from rhs_isac_ros.model.scenario import Scenario
 _MIN_X_M = 1e-15
 # Change of the phase in a cycle below which users are taken for users at rest [rad].
 _AT_REST_RAD = 1.0
+# Way in a cycle up to which users are found, relative to the shortest range of the region.
+_LONGEST_WAY = 0.5
 # Lower limit of a region's extent [wavelengths]; the information for an extent of 0 is infinite.
 _NO_EXTENT = 1e-5
 # Derivative of (y, z) with respect to the position.
@@ -131,10 +133,22 @@ def stands_still(scenario: Scenario, speed_mps: float) -> bool:
     return bool(turn * speed_mps * frames_s(scenario) < _AT_REST_RAD)
 
 
-def undeclared_movement(scenario: Scenario) -> str:
-    """Return a warning if users may move in a cycle, and no velocity is declared; otherwise ''."""
+def movement_warning(scenario: Scenario) -> str:
+    """Return a warning if users move in a cycle otherwise than estimators assume, or ''.
+
+    They may move although no velocity is declared, or so far that the search, whose users stay at
+    one range, may miss the position.
+    """
     speed_mps, duration_s = scenario.max_user_speed_mps, frames_s(scenario)
-    if scenario.user_speed_std_mps or stands_still(scenario, speed_mps):
+    declared_mps = scenario.user_speed_std_mps
+    nearest_m = float(polar_bounds(scenario.roi_bounds_m)[0, 0])
+    if declared_mps * duration_s > _LONGEST_WAY * nearest_m:
+        return (f'user_speed_std_mps: {declared_mps:g}, but such users move by '
+                f'{declared_mps * duration_s:.2g} m in a cycle of {duration_s:.2g} s, and '
+                f'positions may be wrong beyond {_LONGEST_WAY * nearest_m:.2g} m, '
+                f'{_LONGEST_WAY:g} times the shortest range; expected at most '
+                f'{_LONGEST_WAY * nearest_m / duration_s:.2g} m/s, or shorter frames')
+    if declared_mps or stands_still(scenario, speed_mps):
         return ''
     return (f'user_speed_std_mps: 0, but users of max_user_speed_mps = {speed_mps:g} m/s move by '
             f'{speed_mps * duration_s:.2g} m in a cycle of {duration_s:.2g} s, and positions '

@@ -11,7 +11,7 @@ import numpy as np
 from rhs_isac_ros import positioning
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import simulate_received
-from rhs_isac_ros.model.geometry import undeclared_movement
+from rhs_isac_ros.model.geometry import movement_warning
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning.alternatives import unrecognised_outside
 from rhs_isac_ros.positioning.estimate import estimate_of
@@ -38,7 +38,7 @@ class PositionerNode(LocatingNode[Positioner]):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('positioner', **node_options)
-        if text := undeclared_movement(self.scenario):
+        if text := movement_warning(self.scenario):
             self.get_logger().warning(text)  # type: ignore[no-untyped-call]
         settings = self.make_settings(self.values)
         if settings.reject_outside and (text := unrecognised_outside(self.scenario)):

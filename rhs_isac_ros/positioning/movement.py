@@ -15,7 +15,8 @@ These share the prior probability of a user who moves otherwise than declared.
 
 If the scenario declares a velocity, a residual and a velocity that are improbable together also
 show that the user is too fast. With short frames, the phase of the direct path hardly changes
-during a cycle, whatever the user does, and no test is needed.
+during a cycle, whatever the user does, and no test is needed. Nor is one with a single frame in
+each band, if the phases of the bands are unknown: no phases are then compared.
 """
 
 import dataclasses
@@ -85,9 +86,10 @@ class MovementTest:
 
     @classmethod
     def of(cls, system: System, likelihood: Likelihood) -> 'MovementTest | None':
-        """Return the tests, or None if frames are so short that movement does not matter."""
+        """Return the tests, or None if movement does not matter to the phases of the frames."""
         is_short = stands_still(system.scenario, _WALKING_MPS)
-        return None if is_short else cls(system, likelihood)
+        is_single = system.scenario.n_frames == 1 and likelihood.nuisance.is_coarse
+        return None if is_short or is_single else cls(system, likelihood)
 
     def reason(self, fit: Fit, modes: Modes | None, conditionals: Sequence[Conditional],
                signals: Signals, aligned: np.ndarray, level: float) -> str:

@@ -15,7 +15,7 @@ import rhs_isac_msgs.msg as ros
 from rhs_isac_ros.calibration import CalibrationError
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario, ScenarioError
-from rhs_isac_ros.model.geometry import undeclared_movement
+from rhs_isac_ros.model.geometry import movement_warning
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning import ModelError, Site, SiteError
 from rhs_isac_ros.protocol import messages as m
@@ -159,7 +159,7 @@ def choose_scenario(config: Path | None, recording: Path | None = None,
     if not config and recording:
         found = read_networks(recording, site).of(namespace or '')
     scenario = found or Scenario()
-    if text := undeclared_movement(scenario):
+    if text := movement_warning(scenario):
         print(f'warning: {text}', file=sys.stderr)
     return scenario
 

@@ -68,12 +68,21 @@ def test_frame_times_are_relative_to_the_reference_time():
     ({'frame_duration_s': 0.015, 'max_user_speed_mps': 0.05}, False),
     ({'frame_duration_s': 0.015}, True),
     ({'frame_duration_s': 0.015, 'user_speed_std_mps': 1e-3}, False)])
-def test_undeclared_movement_is_named_if_the_phase_changes_by_a_radian_in_a_cycle(
+def test_movement_warning_is_named_if_the_phase_changes_by_a_radian_in_a_cycle(
         changes, is_named):
     """Table I has 3 GHz and 5.6 m/s: 0.35 rad in a millisecond."""
-    text = g.undeclared_movement(Scenario(**changes))
+    text = g.movement_warning(Scenario(**changes))
     assert text.startswith('user_speed_std_mps: 0, but users of max_user_speed_mps') is is_named
     assert ('declare about 3.2 m/s' in text) is is_named
+
+
+def test_a_declared_speed_is_named_if_users_move_far_relative_to_the_range():
+    scenario = Scenario(frame_duration_s=0.015, roi_center_m=(2.5, 0, 0), roi_size_m=(2, 2, 0))
+    # The nearest place is 1.5 m away, and a cycle takes 0.105 s.
+    texts = [g.movement_warning(dataclasses.replace(scenario, user_speed_std_mps=speed))
+             for speed in (7.1, 7.2)]
+    assert not texts[0]
+    assert texts[1].startswith('user_speed_std_mps: 7.2, but such users move by 0.76 m')
 
 
 def test_given_feed_positions_are_used():

@@ -89,3 +89,12 @@ def test_independent_frames_contain_what_failed_elements_do():
 def test_short_frames_need_no_test():
     short = system_of(frame_duration_s=4e-6, user_speed_std_mps=0.0)
     assert MovementTest.of(short, Likelihood(short)) is None
+
+
+@pytest.mark.parametrize('changes', [{}, AT_REST])
+def test_single_frames_need_no_test_unless_the_phases_of_the_bands_are_known(changes):
+    """Otherwise, up to a fifth of the users as declared would have no fix."""
+    single = system_of(n_frames=1, **changes)
+    assert MovementTest.of(single, Likelihood(single)) is None
+    known = system_of(n_frames=1, band_phase_std_rad=0.0, **AT_REST)
+    assert MovementTest.of(known, Likelihood(known))
