@@ -1,8 +1,10 @@
 """The links between the surface and one position, and the division of power among channels."""
 
+import abc
 import dataclasses
 import functools
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,6 +19,7 @@ from rhs_isac_ros.model.surface import NOMINAL, onboard_matrix, ports_of
 
 # Gains above this limit have finite reciprocals.
 _MIN_GAIN = 1e-300
+_LinkT = TypeVar('_LinkT', bound='Link')
 
 
 def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
@@ -53,18 +56,74 @@ def water_filling(gains: np.ndarray, power_w: float) -> np.ndarray:
     return np.where(n_filled > 0, shares, lost)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class BandLink:
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class Link(abc.ABC):
     """The links between the surface and a user in the n_b bands of a choice.
 
     Methods take configurations, float64 [n_b, n, N_E], or [N_E] for one in all bands, with n = 1.
+    A subclass defines `channels`, and the links `at_subbands`.
     """
 
-    onboard: np.ndarray  #: B_j with the gain of the band, complex128 [n_b, N_SB, K, N_E].
     los: np.ndarray  #: Line-of-sight gains, complex128 [n_b, N_SB, N_E].
     spatial: SpatialCovariance  #: V_i.
     noise_power_w: float  #: Noise power of a sub-band [W].
     power_w: float  #: Power of the digital part, summed over sub-bands [W].
+
+    @abc.abstractmethod
+    def channels(self, analog: np.ndarray) -> np.ndarray:
+        """Return the transfer of configurations, complex128 [n_b, n, N_SB, K, N_E]."""
+
+    def at_subbands(self: _LinkT, subbands: np.ndarray) -> _LinkT:
+        """Return the links in a subset of the sub-bands, with their share of the power."""
+        share = len(subbands) / self.los.shape[-2]
+        return dataclasses.replace(
+            self, los=self.los[..., subbands, :], power_w=self.power_w * share)
+
+    def best_digital(self, analog: np.ndarray) -> np.ndarray:
+        """Return the best digital parts of configurations, complex128 [n_b, n, N_SB, K] [sqrt(W)].
+
+        In each sub-band, it is a multiple of the conjugate of the principal eigenvector of the
+        channels' correlation matrix at the feeds. Water-filling divides the power.
+        """
+        _, power, directions = self.eigenbeams(*self.feeds(analog))
+        return directions * np.sqrt(power)[..., None]
+
+    def best_rate(self, analog: np.ndarray) -> np.ndarray:
+        """Return the capacity with the best digital part, summed over sub-bands [nat/symbol]."""
+        gains, power, _ = self.eigenbeams(*self.feeds(analog))
+        return np.log1p(gains * power).sum(axis=-1)
+
+    def feeds(self, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the `channels` between the feeds and the air for configurations.
+
+        Also returns their product with V_i, complex128 [n_b, n, N_SB, K, N_E], and that with the
+        line-of-sight gains, complex128 [n_b, n, N_SB, K, 1].
+        """
+        configured = self.channels(analog)
+        direct = np.matmul(configured, self.los[:, None, ..., None])
+        return configured, self.spatial.scatter(configured), direct
+
+    def eigenbeams(self, configured: np.ndarray, scattered: np.ndarray, direct: np.ndarray
+                   ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the best beam in each sub-band, for the channels of `feeds`.
+
+        The results are its gain relative to noise [1/W] and its power [W], float64 [n_b, n, N_SB],
+        and its direction, complex128 [n_b, n, N_SB, K].
+        """
+        gains, directions = np.linalg.eigh(
+            direct * np.conj(np.swapaxes(direct, -1, -2))
+            + np.matmul(scattered, np.conj(np.swapaxes(configured, -1, -2))))
+        # A configuration may block all signals; only rounding makes the gain negative.
+        gain = np.maximum(gains[..., -1], 0) / self.noise_power_w
+        # s is a row: s M s^H is largest along the conjugate of the eigenvector.
+        return gain, water_filling(gain, self.power_w), np.conj(directions[..., -1])
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class BandLink(Link):
+    """Links of a board whose coefficients are affine in the configuration."""
+
+    onboard: np.ndarray  #: B_j with the gain of the band, complex128 [n_b, N_SB, K, N_E].
     slope: np.ndarray  #: Slopes of the coefficients in the configuration, [n_b, N_E].
     offset: np.ndarray  #: Coefficients for the configuration 0, [n_b, N_E].
 
@@ -78,50 +137,19 @@ class BandLink:
         onboard, slope, offset = arrays(scenario, surface)
         place, index = checked_position(position)[None], band_index(bands)
         los = np.concatenate([los_gain(scenario, place, band) for band in bands])
-        return cls(onboard[index], los, spatial_covariance(scenario)[index],
-                   scenario.noise_power_w, scenario.max_power_w, slope[index], offset[index])
+        return cls(onboard=onboard[index], los=los, spatial=spatial_covariance(scenario)[index],
+                   noise_power_w=scenario.noise_power_w, power_w=scenario.max_power_w,
+                   slope=slope[index], offset=offset[index])
+
+    def channels(self, analog: np.ndarray) -> np.ndarray:
+        """Return B_j times the coefficients; see `Link.channels`."""
+        coefficients = self.slope[:, None] * analog + self.offset[:, None]
+        return self.onboard[:, None] * coefficients[..., None, None, :]
 
     def at_subbands(self, subbands: np.ndarray) -> 'BandLink':
-        """Return the links in a subset of the sub-bands, with their share of the power."""
-        share = len(subbands) / self.los.shape[-2]
+        """Return the links in a subset of the sub-bands; see `Link.at_subbands`."""
         return dataclasses.replace(
-            self, onboard=self.onboard[..., subbands, :, :], los=self.los[..., subbands, :],
-            power_w=self.power_w * share)
-
-    def best_digital(self, analog: np.ndarray) -> np.ndarray:
-        """Return the best digital parts of configurations, complex128 [n_b, n, N_SB, K] [sqrt(W)].
-
-        In each sub-band, it is a multiple of the conjugate of the principal eigenvector of the
-        channels' correlation matrix at the feeds. Water-filling divides the power.
-        """
-        gains, directions = np.linalg.eigh(self.correlations(*self.feeds(analog)))
-        power = water_filling(gains[..., -1] / self.noise_power_w, self.power_w)
-        # s is a row: s M s^H is largest along the conjugate of the eigenvector.
-        return np.conj(directions[..., -1]) * np.sqrt(power)[..., None]
-
-    def best_rate(self, analog: np.ndarray) -> np.ndarray:
-        """Return the capacity with the best digital part, summed over sub-bands [nat/symbol]."""
-        correlations = self.correlations(*self.feeds(analog))
-        gains = np.linalg.eigvalsh(correlations)[..., -1] / self.noise_power_w
-        return np.log1p(gains * water_filling(gains, self.power_w)).sum(axis=-1)
-
-    def feeds(self, analog: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the channels between the feeds and the air for configurations.
-
-        Returns B_j times the coefficients, complex128 [n_b, n, N_SB, K, N_E], its product with
-        V_i, and its product with the line-of-sight gains, complex128 [n_b, n, N_SB, K, 1].
-        """
-        coefficients = self.slope[:, None] * analog + self.offset[:, None]
-        configured = self.onboard[:, None] * coefficients[..., None, None, :]
-        direct = np.matmul(configured, self.los[:, None, ..., None])
-        return configured, self.spatial.scatter(configured), direct
-
-    @staticmethod
-    def correlations(
-            configured: np.ndarray, scattered: np.ndarray, direct: np.ndarray) -> np.ndarray:
-        """Return the correlation matrices of the channels of `feeds`, [..., N_SB, K, K]."""
-        return (direct * np.conj(np.swapaxes(direct, -1, -2))
-                + np.matmul(scattered, np.conj(np.swapaxes(configured, -1, -2))))
+            super().at_subbands(subbands), onboard=self.onboard[..., subbands, :, :])
 
 
 def band_index(bands: Sequence[int]) -> slice | list[int]:

@@ -7,12 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.link.band_link import (
-    BandLink,
-    band_index,
-    representative_subbands,
-    water_filling,
-)
+from rhs_isac_ros.link.band_link import BandLink, band_index, representative_subbands
 from rhs_isac_ros.link.candidates import candidate_configurations, tables
 from rhs_isac_ros.link.capacity import Beamformer, actual_capacity, expected_capacities
 from rhs_isac_ros.link.tuned import tuned_beam
@@ -78,13 +73,9 @@ class _Point(NamedTuple):
     @classmethod
     def at(cls, link: BandLink, spread: np.ndarray, analog: np.ndarray) -> '_Point':
         configured, scattered, direct = link.feeds(analog)
-        gains, directions = np.linalg.eigh(link.correlations(configured, scattered, direct))
-        # The configuration may block all signals; only rounding makes the gain negative.
-        gain = np.maximum(gains[..., -1], 0) / link.noise_power_w
-        power = water_filling(gain, link.power_w)
+        gain, power, directions = link.eigenbeams(configured, scattered, direct)
         snr = gain * power
-        amplitude = np.sqrt(power / link.noise_power_w)
-        digital = (np.conj(directions[..., -1]) * amplitude[..., None])[..., None, :]
+        digital = (directions * np.sqrt(power / link.noise_power_w)[..., None])[..., None, :]
         weights = np.matmul(digital, link.onboard[:, None])[..., 0, :]
         weights *= link.slope[:, None, None]
         received = np.conj(np.matmul(digital, direct)[..., 0])

@@ -11,14 +11,14 @@ import dataclasses
 
 import numpy as np
 
-from rhs_isac_ros.link.band_link import representative_subbands, water_filling
+from rhs_isac_ros.link.band_link import Link, representative_subbands
 from rhs_isac_ros.link.capacity import Beamformer
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import checked_position
-from rhs_isac_ros.model.board import BoardError, Ports
+from rhs_isac_ros.model.board import Board, BoardError, Ports
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
+from rhs_isac_ros.model.multipath import spatial_covariance
 from rhs_isac_ros.model.surface import NOMINAL, Response, on_levels, ports_of
 from rhs_isac_ros.support.threads import one_blas_thread
 
@@ -39,7 +39,7 @@ def tuned_beam(scenario: Scenario, position: np.ndarray, band: int,
     whole = TunedLink.to(scenario, position, band, surface)
     link = whole.at_subbands(representative_subbands(scenario, _MAX_DRIFT_RAD, _MAX_SUBBANDS))
     try:
-        start = scenario.board.focused(whole.ports, whole.response[0] * whole.los)
+        start = scenario.board.focused(whole.ports, whole.response[0] * whole.los[0])
     except BoardError:
         # With coupling, no element has a best tuning of its own.
         start = np.full(scenario.n_elements, 0.5)
@@ -51,61 +51,56 @@ def tuned_beam(scenario: Scenario, position: np.ndarray, band: int,
     end = minimize(loss, start, jac=True, method='L-BFGS-B', bounds=[(0.0, 1.0)] * len(start),
                    options={'maxiter': _N_STEPS}).x
     best = link.exchanged(on_levels(scenario, end), scenario.amplitude_levels)
-    return Beamformer(best, whole.best_digital(best), band)
+    return Beamformer(best, whole.best_digital(best)[0, 0], band)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class TunedLink:
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class TunedLink(Link):
     """The link between a surface and one position in a band, for any board."""
 
-    scenario: Scenario
+    board: Board
     ports: Ports
     response: Response
-    los: np.ndarray  #: Line-of-sight gains, complex128 [N_SB, N_E].
-    spatial: SpatialCovariance  #: V_i.
-    power_w: float  #: Power of the digital part, summed over sub-bands [W].
 
     @classmethod
     def to(cls, scenario: Scenario, position: np.ndarray, band: int,
            surface: SurfaceEstimate | None) -> 'TunedLink':
         """Return the link to a position, float64 [3] [m]."""
         slope, offset, gains = NOMINAL if surface is None else surface.response
-        place = checked_position(position)[None]
         return cls(
-            scenario, ports_of(scenario, band), (slope, offset, np.ravel(gains)[band % np.size(
-                gains)]), los_gain(scenario, place, band)[0],
-            spatial_covariance(scenario)[band], scenario.max_power_w)
+            board=scenario.board, ports=ports_of(scenario, band),
+            response=(slope, offset, np.ravel(gains)[band % np.size(gains)]),
+            los=los_gain(scenario, checked_position(position)[None], band),
+            spatial=spatial_covariance(scenario)[band:band + 1],
+            noise_power_w=scenario.noise_power_w, power_w=scenario.max_power_w)
+
+    def channels(self, analog: np.ndarray) -> np.ndarray:
+        """Return the transfer of the board with the response; see `Link.channels`."""
+        slope, offset, gain = self.response
+        tunings = np.reshape(analog, (1, -1, analog.shape[-1]))
+        return gain * np.swapaxes(self.board.channels(self.ports, tunings, slope, offset), 1, 2)
 
     def at_subbands(self, subbands: np.ndarray) -> 'TunedLink':
-        """Return the link in a subset of the sub-bands, with their share of the power."""
-        ports = dataclasses.replace(
-            self.ports, frequencies_hz=self.ports.frequencies_hz[:, subbands])
-        return dataclasses.replace(self, ports=ports, los=self.los[subbands],
-                                   power_w=self.power_w * len(subbands) / len(self.los))
-
-    def rates(self, tunings: np.ndarray) -> np.ndarray:
-        """Return the capacities with the best digital parts [nat/symbol], [n], for [n, N_E]."""
-        return np.log1p(self._beams(self._channels(tunings))[0]).sum(axis=0)
-
-    def best_digital(self, tunings: np.ndarray) -> np.ndarray:
-        """Return the best digital part for tunings [N_E], complex128 [N_SB, K] [sqrt(W)]."""
-        return self._beams(self._channels(tunings[None]))[1][:, 0]
+        """Return the link in a subset of the sub-bands; see `Link.at_subbands`."""
+        return dataclasses.replace(super().at_subbands(subbands), ports=dataclasses.replace(
+            self.ports, frequencies_hz=self.ports.frequencies_hz[:, subbands]))
 
     def rate_and_gradient(self, tunings: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the capacity of tunings [N_E], and its gradient [N_E].
 
         The digital part is the best one, so its changes do not contribute to the gradient.
         """
-        channels = self._channels(tunings[None])
-        snr, digital = self._beams(channels)
+        feeds = self.feeds(tunings)
+        gains, power, directions = self.eigenbeams(*feeds)
+        snr, digital = gains * power, directions * np.sqrt(power)[..., None]
         slope, _, gain = self.response
-        radiation = np.matmul(digital[:, 0, None], channels[:, 0])[:, 0]
-        by_radiation = np.sum(radiation * self.los, axis=1, keepdims=True) * np.conj(self.los)
+        radiation = np.matmul(digital[..., None, :], feeds[0])[:, 0, :, 0]
+        by_radiation = np.sum(radiation * self.los, axis=2, keepdims=True) * np.conj(self.los)
         by_radiation += self.spatial.scatter(radiation)
-        by_radiation *= 2 / self.scenario.noise_power_w / (1 + snr)
-        gradient = self.scenario.board.by_tunings(
-            self.ports, tunings[None, None], gain * digital[None],
-            np.conj(slope) * by_radiation[None, :, None])
+        by_radiation *= 2 / self.noise_power_w / (1 + snr[:, 0, :, None])
+        gradient = self.board.by_tunings(
+            self.ports, tunings[None, None], gain * np.swapaxes(digital, 1, 2),
+            np.conj(slope) * by_radiation[:, :, None])
         return float(np.log1p(snr).sum()), gradient[0, 0]
 
     def exchanged(self, tunings: np.ndarray, n_levels: int) -> np.ndarray:
@@ -115,32 +110,17 @@ class TunedLink:
         """
         if not n_levels:
             return tunings
-        rate, n = self.rates(tunings[None])[0], len(tunings)
+        rate, n = self.best_rate(tunings)[0, 0], len(tunings)
         levels, counts = np.linspace(0, 1, n_levels), 2**np.arange(n.bit_length())
         for _ in range(_N_EXCHANGES):
             others = np.repeat(tunings[None], n * n_levels, axis=0)
             others[np.arange(len(others)), np.repeat(np.arange(n), n_levels)] = np.tile(levels, n)
-            rates = self.rates(others).reshape(n, n_levels)
+            rates = self.best_rate(others).reshape(n, n_levels)
             order = np.argsort(-rates.max(axis=1))
             is_exchanged = np.argsort(order) < counts[:, None]
             together = np.where(is_exchanged, levels[rates.argmax(axis=1)], tunings)
-            rates = self.rates(together)
+            (rates,) = self.best_rate(together)
             if rates.max() <= rate * (1 + _MIN_GAIN):
                 break
             rate, tunings = rates.max(), together[rates.argmax()]
         return tunings
-
-    def _channels(self, tunings: np.ndarray) -> np.ndarray:
-        """Return the transfer for tunings [n, N_E], complex128 [N_SB, n, K, N_E]."""
-        slope, offset, gain = self.response
-        return gain * self.scenario.board.channels(self.ports, tunings[None], slope, offset)[0]
-
-    def _beams(self, channels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return SNRs [N_SB, n] and the best digital parts [N_SB, n, K] for `_channels`."""
-        direct = channels @ self.los[:, None, :, None]
-        correlations = np.matmul(direct, np.conj(np.swapaxes(direct, -1, -2))) + np.matmul(
-            self.spatial.scatter(channels), np.conj(np.swapaxes(channels, -1, -2)))
-        gains, directions = np.linalg.eigh(correlations)
-        gain_of_noise = np.maximum(gains[..., -1], 0) / self.scenario.noise_power_w
-        power = water_filling(gain_of_noise.T, self.power_w).T
-        return gain_of_noise * power, np.conj(directions[..., -1]) * np.sqrt(power)[..., None]

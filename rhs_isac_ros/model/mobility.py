@@ -95,7 +95,8 @@ class Crowd:
             if isinstance(mobility, StraightMobility):
                 with plugins.calling(place := f'{type(mobility).__name__}.leg'):
                     leg = mobility.leg(now_s)
-                if not isinstance(leg, Leg) or not leg.departure_s <= now_s < leg.end_s:
+                # A plug-in may return a plain tuple.
+                if not isinstance(leg, tuple) or len(leg) != 4 or not leg[2] <= now_s < leg[3]:
                     raise plugins.PluginError(f'{place}: {leg!r}, expected a Leg at {now_s} s')
                 self._origin[user], self._velocity[user] = _vectors(place, leg[:2])
                 self._departure_s[user], self._end_s[user] = leg[2:]

@@ -122,13 +122,20 @@ def test_a_crowd_has_the_states_of_its_users():
     def users():
         walks = [mobility.RandomWalk(Scenario(), speed, np.random.default_rng(n))
                  for n, speed in enumerate((0.0, 0.8, 3.0, 50.0))]
-        return [*walks, mobility.Static((7, -1, 0)), mobility.Waypoints(SQUARE, 2.0), Jump()]
+        return [*walks, mobility.Static((7, -1, 0)), mobility.Waypoints(SQUARE, 2.0), Jump(),
+                Steps()]
 
     class Jump:
         """The mobility of another package."""
 
         def state(self, now_s):
             return np.array([8.0, np.floor(now_s), 0.0]), np.zeros(3)
+
+    class Steps(Jump):
+        """The mobility of another package, which returns its legs as plain tuples."""
+
+        def leg(self, now_s):
+            return *self.state(now_s), np.floor(now_s), np.floor(now_s) + 1
 
     alone, crowd = users(), mobility.Crowd(users())
     for now_s in np.random.default_rng(1).exponential(0.7, 60).cumsum():
