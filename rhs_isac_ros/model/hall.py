@@ -186,7 +186,9 @@ class PathChannel(ArrayFile):
         values['f0'] = values['f0'].reshape(()) if values['f0'].size == 1 else values['f0']
         for name, value in values.items():
             object.__setattr__(self, name, value)
-        shape = np.shape(self.a) if np.ndim(self.a) == 2 and np.size(self.a) else (1, 1)
+        shape = np.shape(self.a)
+        if len(shape) != 2 or not np.size(self.a):
+            raise ArchiveError(f'a: shape {shape}, expected [N, P] for N users with P paths')
         expected: dict[str, tuple[int, ...]] = {
             'a': shape, 'users': (shape[0], 3), 'src': (*shape, 3), 'n': shape, 'f0': ()}
         if self.gains is not None:
@@ -386,7 +388,7 @@ class PathChannel(ArrayFile):
         Files of MATLAB have the suffix ``.mat``. Raises ArchiveError if the file cannot be read or
         its content is invalid, and MissingLibraryError for MATLAB 7.3 without h5py.
         """
-        arrays = (read_matlab(path, {*_TYPES}) if Path(path).suffix == '.mat'
+        arrays = (read_matlab(path, {*_TYPES}) if Path(path).suffix.lower() == '.mat'
                   else read_arrays(path))
         with translated((TypeError, ValueError), ArchiveError, path):
             for name in _TYPES:

@@ -299,6 +299,9 @@ def _read_hdf5(path: str | Path, names: set[str]) -> dict[str, np.ndarray]:
 
     with h5py.File(path) as file:
         sets = {name: file[name] for name in names & {*file}}
+        for name, one in sets.items():
+            if not isinstance(one, h5py.Dataset):
+                raise ValueError(f'{name}: a structure or a sparse matrix, expected numbers')
         if sum(16 * one.size for one in sets.values()) > _MAX_BYTES:
             raise ValueError('more than 256 MiB of arrays')
         # The axes are reversed. An empty array is stored as its shape.

@@ -229,6 +229,17 @@ def as_json(value: Any) -> Any:
     return type(value)(map(as_json, value)) if type(value) in (list, tuple) else value
 
 
+def _check_keys(value: Any) -> None:
+    """Raise TypeError unless all keys are texts: in JSON, 1 and '1' would be the same key."""
+    if isinstance(value, Mapping):
+        for key in value:
+            if not isinstance(key, str):
+                raise TypeError(f'key {key!r}, expected texts as keys')
+    for one in value.values() if isinstance(value, Mapping) else (
+            value if isinstance(value, list | tuple) else ()):
+        _check_keys(one)
+
+
 def _checked(job: Job) -> Job:
     """Return a job without values of NumPy; raise ValueError if it cannot be stored."""
     if not job.name or Path(job.name).name != job.name:
@@ -237,6 +248,7 @@ def _checked(job: Job) -> Job:
     for name, value in arguments.items():
         try:
             json.dumps(value)
+            _check_keys(value)
         except (TypeError, ValueError) as error:
             raise ValueError(f'job {job.name}: {name}: {value!r}, expected numbers, texts, lists '
                              f'and mappings: {error}') from None

@@ -148,6 +148,7 @@ BAD = [
     ('src', lambda x: np.where([[False], [True]], x * [-1, 1, 1], x), 'x = -.* in front of the'),
     ('a', lambda x: 100 * x, 'times that of free space'),
     ('gains', lambda x: np.ones((20, 2, 64), complex), '64 elements, expected 100'),
+    ('a', lambda x: x[:, :0], r'shape \(20, 0\), expected \[N, P\] for N users with P paths'),
     ('src', None, 'missing'),
     ('n', lambda x: np.where(x, np.nan, x), 'not finite'),
     ('n', lambda x: x + 0.5, '0.5, expected integers'),
@@ -321,7 +322,8 @@ def test_files_of_matlab_are_channels(mirror, tmp_path, write):
     arrays = {name: getattr(mirror, name) for name in ('users', 'a', 'src')}
     write(tmp_path / 'hall.mat', {**arrays, 'n': mirror.n.astype(float), 'f0': F0})
     assert PathChannel.load(tmp_path / 'hall.mat') == mirror
-    assert Scenario(channel=tmp_path / 'hall.mat').channel == mirror
+    (tmp_path / 'hall.mat').rename(tmp_path / 'HALL.MAT')
+    assert Scenario(channel=tmp_path / 'HALL.MAT').channel == mirror
     write(tmp_path / 'few.mat', arrays)
     with pytest.raises(ArchiveError, match='few.mat: n: missing'):
         PathChannel.load(tmp_path / 'few.mat')
@@ -337,6 +339,12 @@ def test_a_damaged_file_of_matlab_is_an_error(tmp_path, content):
 def test_a_structure_of_matlab_is_no_channel(mirror, tmp_path):
     scipy.io.savemat(tmp_path / 'hall.mat', {'a': {'re': 1, 'im': 2}})
     with pytest.raises(ArchiveError, match=r'a: \[.*, expected numbers'):
+        PathChannel.load(tmp_path / 'hall.mat')
+    h5py = pytest.importorskip('h5py')
+    write_matlab7(tmp_path / 'hall.mat', {'n': mirror.n})
+    with h5py.File(tmp_path / 'hall.mat', 'a') as file:
+        file.create_group('a')
+    with pytest.raises(ArchiveError, match='a: a structure or a sparse matrix, expected numbers'):
         PathChannel.load(tmp_path / 'hall.mat')
 
 

@@ -318,8 +318,10 @@ def test_values_of_numpy_are_numbers_and_lists(tmp_path):
 
 def test_an_argument_without_json_is_refused_before_any_job_runs(tmp_path):
     worker = Worker()
-    with pytest.raises(ValueError, match=r'^job b: of: \{1\}, expected numbers, texts, lists'):
-        run_jobs(worker, [JOBS[0], Job('b', {'number': 1, 'of': {1}})], tmp_path, n_jobs=1)
+    for value, text in (({1}, r'\{1\}, expected numbers'),
+                        ([{1: 2}], r'\[\{1: 2\}\].*key 1, expected texts')):
+        with pytest.raises(ValueError, match=rf'^job b: of: {text}'):
+            run_jobs(worker, [JOBS[0], Job('b', {'number': 1, 'of': value})], tmp_path, n_jobs=1)
     assert worker.seen == []
 
 
