@@ -80,6 +80,10 @@ class Mixture(_Arrays):
             raise ValueError(f'covariances: {problem}')
         return super().__new__(cls, weights, centres, spreads)
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Return what copies and pickles consist of, without checks: a result may have no rows."""
+        return type(self)._make, (tuple(self),), vars(self)
+
     @property
     def log_mass(self) -> float:
         """Logarithm of the integral of the density."""

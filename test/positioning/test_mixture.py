@@ -1,5 +1,7 @@
 """Mixtures of Gaussians in the frame of the site."""
 
+import pickle
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -25,6 +27,17 @@ def test_mixtures_are_equal_if_they_are_the_same():
     assert first == first != second
     assert [second, first].index(first) == 1
     assert len({first, second}) == 2
+
+
+@pytest.mark.parametrize('n', [0, 2])
+def test_a_pickled_mixture_is_the_same(n):
+    """Surfaces that list no place outside have a mixture without components."""
+    before = select(mixture(1), np.arange(n)).shared(np.eye(3))
+    after = pickle.loads(pickle.dumps(before))
+    assert type(after) is Mixture
+    np.testing.assert_array_equal(after.constant_covariance, np.eye(3))
+    for one, other in zip(before, after, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_the_moments_are_those_of_the_density():
