@@ -68,6 +68,9 @@ class Sighting:
     misfit_log_ratio: float = np.nan
     #: Where a user outside may be; None if all places are equally likely.
     places: Places | None = None
+    #: Bounds of the region of the surface in its frame, float64 [2, 3] [m]; by default, those of
+    #: the smallest box that contains the region in which the likelihoods are multiplied.
+    region_m: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         """Check the probability."""

@@ -594,5 +594,5 @@ class _Found(NamedTuple):
             pose, placed.weighted(log_evidence),
             float(np.clip(blocked + (1 - blocked) * MISS_PROBABILITY, 0.0, 1 - 1e-12)), sheets,
             misfit_log_ratio=misfit_log_ratio(fit.residual, estimator._n_measurements),
-            places=places,
+            places=places, region_m=estimator._bounds,
             **{f'{name}_log_ratio': value for name, value in self.log_ratios.items()})

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import checked_bounds, log_sum, mixture_weights
+from rhs_isac_ros.model.arrays import checked_bounds, mixture_weights
 from rhs_isac_ros.model.gaussian import likelihood_loss, moments, step_to_maximum, symmetric
 from rhs_isac_ros.model.geometry import polar_derivative, to_positions
 from rhs_isac_ros.model.pose import Pose
@@ -42,7 +42,7 @@ from rhs_isac_ros.positioning.products import (
     proposal,
 )
 from rhs_isac_ros.positioning.segments import concatenate, select
-from rhs_isac_ros.positioning.sheets import move_inside
+from rhs_isac_ros.positioning.sheets import Sheets, move_inside
 from rhs_isac_ros.positioning.templates import standard_normal
 from rhs_isac_ros.support.recent import Recent
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -77,13 +77,16 @@ class _Limits(NamedTuple):
     # Logarithm of the largest value of sheets in the region, relative to their maxima, below which
     # all of them are far from it.
     far: float = -12.0
-    # Largest logarithm of a share that is due to the tails of sheets alone.
+    # Largest logarithm of an average that is due to the tails of sheets alone.
     tail: float = -9.0
-    # Smallest logarithm of a share, relative to that of the constant.
+    # Smallest logarithm of an average, relative to that of the constant.
     least: float = -10.0
+    # Smallest extent of a region in its volume [m].
+    extent_m: float = 1e-3
 
 
 _LIMITS = _Limits()
+_AT_SURFACE = Pose()
 
 
 def fuse(sightings: Sequence[Sighting], bounds_m: np.ndarray, outside_probability: float = 0.0,
@@ -149,16 +152,28 @@ class Fuser:
                 [one.mixture for one in sightings], self._velocity_variance)
 
 
-def _log_share_of(mixture: Mixture, bounds_m: np.ndarray) -> float:
-    """Return the logarithm of the probability of a region, or minus infinity."""
-    free = np.ptp(bounds_m, axis=0) > 0
-    mixture = mixture.position()
-    positions = mixture.means[:, None] + np.matmul(
-        standard_normal(_LIMITS.of_sheet),
-        np.swapaxes(np.linalg.cholesky(mixture.covariances), 1, 2))
-    within = ((positions >= bounds_m[0]) & (positions <= bounds_m[1]))[..., free].all(axis=-1)
-    with np.errstate(divide='ignore'):
-        return float(np.log(mixture.probabilities @ within.mean(axis=1)))
+def _inside(sheets: Sheets, bounds_m: np.ndarray, pose: Pose, near: np.ndarray) -> Mixture:
+    """Return averages and moments of sheets in a box, which contains positions near to them."""
+    gaussians = sheets.inside(bounds_m, pose, near)
+    positions, log_ratio = gaussians.sample(standard_normal(_LIMITS.of_sheet))
+    return _moments(positions, gaussians.logarithm(positions) + log_ratio)
+
+
+def _log_average(sheets: Sheets, bounds_m: np.ndarray) -> float:
+    """Return the logarithm of the average of sheets in a box in the frame of their surface."""
+    points = move_inside(sheets.means, np.linalg.inv(sheets.covariances), bounds_m)
+    return _inside(sheets, bounds_m, _AT_SURFACE, to_positions(points)).log_mass
+
+
+def _log_size(bounds_m: np.ndarray) -> float:
+    """Return the logarithm of the volume of a box, which may have no extent along an axis."""
+    return float(np.log(np.maximum(np.ptp(bounds_m, axis=0), _LIMITS.extent_m)).sum())
+
+
+def _smallest_box(bounds_m: np.ndarray, pose: Pose) -> np.ndarray:
+    """Return the bounds of the smallest box in the frame of a surface that contains a box."""
+    corners = pose.to_surface(np.stack(np.meshgrid(*bounds_m.T), axis=-1).reshape(-1, 3))
+    return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
 
 class _Factor(NamedTuple):
@@ -182,29 +197,30 @@ class _Factor(NamedTuple):
         derivative = polar_derivative(points) @ pose.rotation.T
         sheets = sheets.widened(symmetric(
             derivative @ pose.spread(best) @ np.swapaxes(derivative, 1, 2)))
-        gaussians = sheets.inside(bounds_m, pose, best)
-        positions, log_ratio = gaussians.sample(standard_normal(_LIMITS.of_sheet))
-        inside = _moments(positions, gaussians.logarithm(positions) + log_ratio)
+        inside = _inside(sheets, bounds_m, pose, best)
         kept = np.flatnonzero(_has_mass(inside))
         sheets, inside = select(sheets, kept), select(inside, kept)
         curvature = np.linalg.inv(sheets.covariances)
         heights = -likelihood_loss(points[kept] - sheets.means, curvature)
         centre, size = bounds_m.mean(axis=0), np.ptp(bounds_m, axis=0)
-        tail = inside.log_mass + np.log(size[size > 0]).sum() - log_sum(
-            sheets.as_density().log_weights)
-        # Without moments, the region of the surface is not known. If a sheet has its maximum in
-        # that of the site, it is taken to be the same.
-        log_share = _log_share_of(sighting.mixture, bounds_m) if sighting.sheets else float(
-            heights.max())
+        region_m = sighting.region_m
+        if region_m is None:
+            region_m = _smallest_box(bounds_m, pose)
+        # Without sheets, the region of the surface is not known. If a maximum is in that of the
+        # site, it is taken to be the same.
+        log_average = inside.log_mass - _log_average(
+            sighting.sheets, region_m) if sighting.sheets else float(heights.max())
+        is_far = heights.max() < _LIMITS.far
+        if is_far:
+            log_average = min(log_average, _LIMITS.tail)
         # A product with the sheets remains if all of them are far from the region.
-        log_share = max(float(np.logaddexp(log_share, min(tail, _LIMITS.tail))),
-                        float(np.log(sighting.missing)) + _LIMITS.least)
-        log_total = inside.log_mass - np.log1p(-sighting.missing) - log_share
+        log_average = max(log_average, float(np.log(sighting.missing)) + _LIMITS.least)
+        log_total = inside.log_mass - np.log1p(-sighting.missing) - log_average
         log_peaks, log_limit = sheets.log_peaks - log_total, np.inf
-        if heights.max() < _LIMITS.far:
+        if is_far:
             # Masses and maxima of tails are inaccurate, and must not exceed those of other sheets.
-            log_peaks += log_share - heights.max() - log_peaks.max()
-            log_limit = log_share
+            log_peaks += log_average - heights.max() - log_peaks.max()
+            log_limit = log_average
         return cls(
             pose, concatenate(
                 Rows(sheets.means, sheets.covariances, curvature, log_peaks,
@@ -215,7 +231,8 @@ class _Factor(NamedTuple):
                 np.append(inside.log_weights - log_total, np.log(sighting.missing)),
                 np.append(inside.means, centre[None], axis=0),
                 np.append(inside.covariances, regular(np.diag(size**2 / 12))[None], axis=0))),
-            log_share, -statistics.median([*curvature[:, 0, 0].tolist(), 0.0]))
+            min(log_average + _log_size(bounds_m) - _log_size(region_m), 0.0),
+            -statistics.median([*curvature[:, 0, 0].tolist(), 0.0]))
 
     def term(self, chosen: np.ndarray) -> Term:
         """Return the rows with these indices, int [T], as factors of products."""

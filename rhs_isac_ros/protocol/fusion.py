@@ -82,6 +82,12 @@ def _values(message: m.Posterior, names: Sequence[str]) -> list[Any]:
     return [getattr(message, name) for name in names]
 
 
+def _log_size(bounds_m: np.ndarray) -> float:
+    """Return the logarithm of the volume of a region, without the axes along which it has none."""
+    size = np.ptp(bounds_m, axis=0)
+    return float(np.log(size[size > 0]).sum())
+
+
 @dataclasses.dataclass
 class _Fix:
     """The answers of the surfaces about one user in one cycle, by the names of the surfaces."""
@@ -219,7 +225,9 @@ class Fusion(Role):
             self._no_fix(fix)
             return
         begin = self._stopwatch()
-        sightings = {name: sighting_of(one) for name, one in fix.posteriors.items()}
+        sightings = {name: dataclasses.replace(
+            sighting_of(one), region_m=self._surfaces[name].scenario.roi_bounds_m)
+            for name, one in fix.posteriors.items()}
         # Anything may be published on the topic, such as a mixture inside the surface.
         fuser = Fuser(self._bounds_m, *self._users)
         try:
@@ -261,11 +269,10 @@ class Fusion(Role):
             m.PositionEstimate, source, position=fused.mean, covariance_m2=fused.covariance,
             crlb_m2=self._bound_m2(answers, fused.mean),
             estimator=f'fusion of {", ".join(answers)}', latency_s=latency_s, **common))
-        # The agreement is relative to a different user at each surface.
-        size = np.ptp(self._bounds_m, axis=0)
-        volume = (len(answers) - 1) * float(np.log(size[size > 0]).sum())
-        log_evidence = float(fused.log_agreement) - volume + sum(
-            one.log_evidence for one in answers.values())
+        # The agreement is relative to a different user in the region of each surface.
+        averages = (one.log_evidence - _log_size(self._surfaces[name].scenario.roi_bounds_m)
+                    for name, one in answers.items())
+        log_evidence = float(fused.log_agreement) + _log_size(self._bounds_m) + sum(averages)
         missing = math.prod(one.missing for one in sightings.values())
         self.send(posterior_of(source, Sighting(
             self._pose, fused.mixture.weighted(log_evidence), missing), **common))

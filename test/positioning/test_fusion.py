@@ -385,5 +385,17 @@ def test_the_tail_of_a_sheet_far_beyond_the_region_agrees_with_no_surface():
     assert fuse(seen, BOUNDS).log_agreement < np.log(1e-3) + 0.1
 
 
+def test_a_user_in_the_region_of_the_site_is_likelier_the_larger_that_of_the_surface():
+    """Evidences outside are relative to the average over the region of the surface."""
+    turned = Pose((10 - 50**0.5, -50**0.5, 0.0), (0.0, 0.0, np.sin(np.pi / 8), np.cos(np.pi / 8)),
+                  EXACT)
+    twice = BOUNDS * [1.0, 2.0, 1.0]
+    for pose, region_m, ratio in ((FRONT, None, 1), (FRONT, BOUNDS, 1), (FRONT, twice, 2),
+                                  (turned, None, 2)):
+        one = sheets(pose, PLACE)
+        found = outside_probability(1.0, poses=[pose], sheets=one.likelihood, region_m=region_m)
+        assert found == pytest.approx(1 / (1 + ratio * np.exp(-1)), abs=0.01)
+
+
 def test_users_are_inside_if_no_surface_knows_about_users_outside():
     assert np.isnan(outside_probability(np.nan, np.nan))
