@@ -2,9 +2,9 @@
 
 For each surface, the likelihood of a position outside is a sum of Gaussians and a constant, like
 that of a position inside: see `Places`. The evidence is the average of the product of these sums
-over one prior of the places outside. So surfaces that see the user at different places outside do
-not agree on a user outside. Of a surface that says no more than whether the user is outside, the
-likelihood is a constant.
+over one prior of the places outside, in front of all surfaces. So surfaces that see the user at
+different places outside do not agree on a user outside. Of a surface that says no more than
+whether the user is outside, the likelihood is a constant.
 """
 
 import functools
@@ -31,11 +31,15 @@ class _Limits(NamedTuple):
     products: int = 128
     margin: float = 15.0
     samples: int = 16
+    # Numbers of ranges and directions of the points that represent a surface's prior.
+    ranges: int = 32
+    directions: int = 64
     # Smallest share of a likelihood that is a constant or beyond a region.
     least: float = 1e-9
 
 
 _LIMITS = _Limits()
+_AT_SURFACE = Pose()
 
 
 def places_of(outside: Sheets, log_ratio: float, scenario: Scenario) -> Places:
@@ -45,8 +49,9 @@ def places_of(outside: Sheets, log_ratio: float, scenario: Scenario) -> Places:
     contains; `log_ratio` is the logarithm of the evidence outside relative to that inside.
     """
     pose, farthest_m = scenario.pose, farthest_range_m(scenario)
-    places = outside.to_mixture(pose)
-    log_prior = _log_prior(places.means, pose, farthest_m)
+    places, own = outside.to_mixture(pose), _Prior.over((_AT_SURFACE, farthest_m),
+                                                        bounds_m=scenario.roi_bounds_m)
+    log_prior = _log_prior(places.means, pose, farthest_m) - _log_mass(own)
     known = np.isfinite(log_prior)
     log_rest = log_ratio + float(np.log(max(
         1 - np.exp(places.log_weights[known]).sum(), _LIMITS.least)))
@@ -69,7 +74,9 @@ def log_evidence(sightings: Sequence[Sighting], log_shares: Sequence[float],
     if not len(product.rows.means):
         return constant
     positions = _samples(product.rows)
-    logs = np.where(_is_outside(positions, bounds_m), _common_prior(sightings, positions), -np.inf)
+    prior = _Prior.over(*((one.pose, one.places.farthest_m) for one in sightings if one.places),
+                        bounds_m=bounds_m)
+    logs = prior.log_density(positions)
     total = np.logaddexp.reduce(
         (product.rows.log_weights[:, None] + logs).ravel()) - np.log(_LIMITS.samples)
     return float(np.logaddexp(constant, total))
@@ -121,12 +128,41 @@ def _is_outside(positions: np.ndarray, bounds_m: np.ndarray) -> np.ndarray:
     return ((positions < bounds_m[0]) | (positions > bounds_m[1])).any(axis=-1)
 
 
-def _common_prior(sightings: Sequence[Sighting], positions: np.ndarray) -> np.ndarray:
-    """Return the logarithm of the mean of the surfaces' priors where all may see the user."""
-    logs = np.array([_log_prior(positions, one.pose, one.places.farthest_m)
-                     for one in sightings if one.places])
-    return np.where(np.isfinite(logs).all(axis=0), np.logaddexp.reduce(
-        logs, axis=0) - np.log(len(logs)), -np.inf)
+class _Prior(NamedTuple):
+    """The mean of the priors of surfaces, where all of them may see the user.
+
+    As a user inside, a user outside is in front of all surfaces.
+    """
+
+    surfaces: tuple[tuple[Pose, float], ...]  # Poses and largest ranges [m].
+    corners_m: tuple[float, ...]  # Bounds of the region.
+
+    @classmethod
+    def over(cls, *surfaces: tuple[Pose, float], bounds_m: np.ndarray) -> '_Prior':
+        """Take poses and largest ranges, and the bounds of the region, [2, 3] [m]."""
+        return cls(surfaces, tuple(bounds_m.ravel().tolist()))
+
+    def log_density(self, positions: np.ndarray) -> np.ndarray:
+        """Evaluate the logarithm of the density at positions [..., 3] outside of the region."""
+        return self._log_mean(positions) - _log_mass(self)
+
+    def _log_mean(self, positions: np.ndarray) -> np.ndarray:
+        logs = np.array([_log_prior(positions, *one) for one in self.surfaces])
+        is_outside = _is_outside(positions, np.reshape(self.corners_m, (2, 3)))
+        return np.where(np.isfinite(logs).all(axis=0) & is_outside, np.logaddexp.reduce(
+            logs, axis=0) - np.log(len(logs)), -np.inf)
+
+
+@functools.lru_cache
+def _log_mass(prior: _Prior) -> float:
+    """Return the logarithm of the mass of a prior before it is normalised."""
+    sight = standard_normal(_LIMITS.directions) * 1.0
+    sight[:, 0] = np.abs(sight[:, 0])
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    shares = (np.arange(_LIMITS.ranges) + 0.5) / _LIMITS.ranges
+    seen = [np.isfinite(prior._log_mean(pose.to_site(farthest_m * shares[:, None, None] * sight)))
+            for pose, farthest_m in prior.surfaces]
+    return float(np.log(max(np.mean(seen), _LIMITS.least)))
 
 
 def _log_prior(positions: np.ndarray, pose: Pose, farthest_m: float) -> np.ndarray:

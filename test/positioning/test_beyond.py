@@ -35,6 +35,20 @@ def evidence(*sightings):
     return log_evidence(sightings, [0.0] * len(sightings), BOUNDS)
 
 
+def log_in_sight(*poses, n=200_000, farthest_m=47.5):
+    """Return the logarithm of the share of the prior outside of the region, in sight of all."""
+    rng = np.random.default_rng(0)
+    sight = rng.standard_normal((len(poses), n, 3))
+    sight[..., 0] = np.abs(sight[..., 0])
+    sight *= farthest_m * rng.random((len(poses), n, 1)) / np.linalg.norm(
+        sight, axis=2, keepdims=True)
+    places = np.stack([pose.to_site(each) for pose, each in zip(poses, sight, strict=True)])
+    outside = ((places < BOUNDS[0]) | (places > BOUNDS[1])).any(axis=2)
+    in_sight = np.all([(pose.to_surface(places)[..., 0] > 0) & (np.linalg.norm(
+        places - pose.origin, axis=2) < farthest_m) for pose in poses], axis=0)
+    return np.log(np.mean(outside & in_sight))
+
+
 def test_one_surface_has_its_own_evidence():
     assert evidence(seen(FRONT)) == pytest.approx(LOG_RATIO, abs=1e-6)
     assert evidence(seen(FRONT, PLACE)) == pytest.approx(LOG_RATIO, abs=0.05)
@@ -54,7 +68,8 @@ def test_a_surface_without_places_has_no_influence_on_the_place():
     # Beyond what a surface lists, the likelihood is a constant. The prior is the mean of both.
     one, other = (np.linalg.norm(each.pose.to_surface(PLACE)) for each in (FRONT, SIDE))
     assert evidence(seen(FRONT, PLACE), seen(SIDE, OTHER, share=0.5)) == pytest.approx(
-        2 * LOG_RATIO + np.log(0.5) + np.log((1 + (one / other)**2) / 2), abs=0.05)
+        2 * LOG_RATIO + np.log(0.5) + np.log((1 + (one / other)**2) / 2)
+        + log_in_sight(FRONT.pose) - log_in_sight(FRONT.pose, SIDE.pose), abs=0.05)
 
 
 def test_products_have_the_integral_of_the_likelihoods():
@@ -65,7 +80,8 @@ def test_products_have_the_integral_of_the_likelihoods():
     prior = np.mean([1 / (2 * np.pi * sighting.places.farthest_m * range_m**2)
                      for sighting, range_m in zip((one, other), ranges, strict=True)], axis=0)
     outside = ((positions < BOUNDS[0]) | (positions > BOUNDS[1])).any(axis=1)
-    expected = np.log(np.mean(np.exp(logs) * prior * outside) * 1000.0)
+    expected = np.log(np.mean(np.exp(logs) * prior * outside) * 1000.0) - log_in_sight(
+        FRONT.pose, SIDE.pose)
     assert evidence(one, other) == pytest.approx(expected, abs=0.1)
 
 
