@@ -15,14 +15,9 @@ import numpy as np
 from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.bounds.average import Average
 from rhs_isac_ros.calibration import Calibration
+from rhs_isac_ros.codebook import methods
 from rhs_isac_ros.codebook.cell import REGION, Cell, Prior
 from rhs_isac_ros.codebook.codebook import Codebook, CodebookError, Provenance
-from rhs_isac_ros.codebook.methods import (
-    minimize_alternating,
-    minimize_direct,
-    minimize_genetic,
-    minimize_lbfgs,
-)
 from rhs_isac_ros.codebook.objective import OBJECTIVES, SAMPLINGS
 from rhs_isac_ros.codebook.problem import BudgetSpent, Problem, Progress, Search
 from rhs_isac_ros.codebook.unoptimised import STARTS, random_codebook
@@ -53,11 +48,11 @@ class Method(NamedTuple):
 
 
 METHODS: Mapping[str, Method] = {
-    'alternating': Method(minimize_alternating, 400),
-    'direct': Method(minimize_direct, 400),
+    'alternating': Method(methods.minimize_alternating, 400),
+    'direct': Method(methods.minimize_direct, 400),
     'directional': Method(None),
-    'genetic': Method(minimize_genetic, 10),
-    'lbfgs': Method(minimize_lbfgs, 3000),
+    'genetic': Method(methods.minimize_genetic, 10),
+    'lbfgs': Method(methods.minimize_lbfgs, 3000),
     'random': Method(None),
 }
 

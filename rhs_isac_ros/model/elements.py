@@ -23,6 +23,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from rhs_isac_ros.model import multipath
 from rhs_isac_ros.model.arrays import (
     adjoint,
     blocks,
@@ -32,12 +33,6 @@ from rhs_isac_ros.model.arrays import (
     read_only,
 )
 from rhs_isac_ros.model.los import los_gain
-from rhs_isac_ros.model.multipath import (
-    complex_normal,
-    measurement_correlation,
-    multipath_covariance,
-    spatial_covariance,
-)
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import Beamforming, Response, radiation_matrix
 from rhs_isac_ros.support import streams
@@ -148,9 +143,9 @@ class DeclaredElements(SurfaceModel):
         # [N_B, N_SB F, T, N_E]
         radiation = np.moveaxis(error_radiation(scenario, beams), 0, 2)
         n_bands, n_rows = radiation.shape[:2]
-        amplitude = np.sqrt(spatial_covariance(scenario).power)
+        amplitude = np.sqrt(multipath.spatial_covariance(scenario).power)
         flat = (radiation * amplitude[:, None, None]).reshape(n_bands, n_rows, -1)
-        return (measurement_correlation(scenario) * np.matmul(flat, adjoint(flat)),
+        return (multipath.measurement_correlation(scenario) * np.matmul(flat, adjoint(flat)),
                 functools.partial(_declared_errors, scenario, radiation))
 
 
@@ -271,7 +266,7 @@ def draw_surface(scenario: Scenario, rng: np.random.Generator) -> ElementErrors:
     """
     n_elements = scenario.n_elements
     fate, levels = rng.uniform(size=(2, n_elements))
-    gains = 1 + scenario.element_error_rms * complex_normal((n_elements,), rng)
+    gains = 1 + scenario.element_error_rms * multipath.complex_normal((n_elements,), rng)
     return ElementErrors(
         gains, np.where(fate < scenario.failed_element_share, levels, np.nan))
 
@@ -316,8 +311,8 @@ def element_correlation(
         gains = los_gain(scenario, positions[block], band)
         direct += np.einsum('n,njm,nlm->jlm', shares[block], gains, np.conj(gains))
     correlation = np.repeat(np.repeat(direct, scenario.n_frames, 0), scenario.n_frames, 1)
-    power = spatial_covariance(scenario).power[band]
-    correlation += measurement_correlation(scenario)[band][..., None] * power
+    power = multipath.spatial_covariance(scenario).power[band]
+    correlation += multipath.measurement_correlation(scenario)[band][..., None] * power
     return read_only(correlation)
 
 
@@ -348,6 +343,6 @@ def scattered_errors(
     Takes the weights of `element_radiation` and the covariance of gains and offsets, complex128
     [2 N_E, 2 N_E]. Returns complex128 [N_B, N_SB F, N_SB F].
     """
-    spatial = np.tile(multipath_covariance(scenario), (1, 2, 2))
+    spatial = np.tile(multipath.multipath_covariance(scenario), (1, 2, 2))
     products = np.matmul(radiation @ (spatial * errors), adjoint(radiation))
-    return measurement_correlation(scenario) * products
+    return multipath.measurement_correlation(scenario) * products

@@ -9,15 +9,10 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from rhs_isac_ros.model import geometry
 from rhs_isac_ros.model.arrays import checked_positions
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.gain_pattern import GainPattern
-from rhs_isac_ros.model.geometry import (
-    element_normals,
-    element_positions,
-    frame_times_s,
-    subband_frequencies_hz,
-)
 from rhs_isac_ros.model.scenario import Scenario
 
 # Minimum distance of the user from a boresight. On the boresight itself, the direction
@@ -78,7 +73,7 @@ def los_sums(scenario: Scenario, positions: np.ndarray, bands: Sequence[int],
              weights: np.ndarray) -> np.ndarray:
     """Sum `los_gain` of n bands over elements, weighted [n, N_SB, N_E]; return [n, N, N_SB]."""
     gain, _, _ = los_waves(scenario, checked_positions(positions), bands, slopes=False)
-    scaled = weights / subband_frequencies_hz(scenario)[list(bands), :, None]
+    scaled = weights / geometry.subband_frequencies_hz(scenario)[list(bands), :, None]
     return np.swapaxes((gain @ scaled[..., None])[..., 0], 1, 2)
 
 
@@ -107,7 +102,7 @@ def frame_gains(scenario: Scenario, states: np.ndarray, by_unknown: np.ndarray,
     elements. Without velocities, the gains of all frames are equal, and F is 1.
     """
     times_s = (np.zeros((scenario.n_bands, 1)) if states.shape[1] == 3
-               else frame_times_s(scenario))
+               else geometry.frame_times_s(scenario))
     n_elements, n_unknowns = len(np.arange(scenario.n_elements)[elements]), by_unknown.shape[2]
     found = np.empty((len(states), 1 + n_unknowns, len(times_s), scenario.n_subbands,
                       times_s.shape[1], n_elements), complex)
@@ -135,7 +130,7 @@ def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int], *
     components of b along `boresight_axes`.
     Without `slopes`, the gain is repeated in place of a, and there are no terms.
     """
-    elements = element_positions(scenario)
+    elements = geometry.element_positions(scenario)
     distances = np.sqrt(sum(
         (positions[:, axis, None] - elements[:, axis])**2 for axis in range(3)))
     inverse, turn = 1 / distances, -2 * np.pi / SPEED_OF_LIGHT_MPS * distances
@@ -151,7 +146,7 @@ def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int], *
             np.multiply(waves[:, subband - 1], step, out=waves[:, subband])
         return waves
 
-    frequencies = subband_frequencies_hz(scenario)[list(bands)]
+    frequencies = geometry.subband_frequencies_hz(scenario)[list(bands)]
     phasors = _phasors(turn * frequencies[:, :1, None])
     gain = over_subbands(phasors * amplitude)
     if not slopes:
@@ -184,13 +179,13 @@ def boresight_axes(scenario: Scenario) -> Sequence[int]:
 
 def _positions_first(scenario: Scenario, band: int, waves: np.ndarray) -> np.ndarray:
     """Divide an array of `Waves` by the frequency, and return it as [N, N_SB, N_E]."""
-    return np.divide(np.moveaxis(waves, 0, 1), subband_frequencies_hz(scenario)[band][:, None],
-                     order='C')
+    frequencies_hz = geometry.subband_frequencies_hz(scenario)[band]
+    return np.divide(np.moveaxis(waves, 0, 1), frequencies_hz[:, None], order='C')
 
 
 def _offsets(scenario: Scenario, positions: np.ndarray) -> np.ndarray:
     """Return the vectors from every element to the user, float64 [N, N_E, 3] [m]."""
-    return positions[:, None, :] - element_positions(scenario)
+    return positions[:, None, :] - geometry.element_positions(scenario)
 
 
 class _Boresight(NamedTuple):
@@ -205,7 +200,7 @@ class _Boresight(NamedTuple):
 def _boresights(scenario: Scenario, positions: np.ndarray) -> list[_Boresight]:
     """Return the boresights that have gain patterns; the user's one is parallel to x."""
     gains = 'element_gain', 'user_gain'
-    normals = None if scenario.element_normals is None else element_normals(scenario)
+    normals = None if scenario.element_normals is None else geometry.element_normals(scenario)
     found: list[_Boresight] = []
     for facing, names in [(None, gains)] if normals is None else [
             (normals, gains[:1]), (None, gains[1:])]:

@@ -13,6 +13,7 @@ import functools
 
 import numpy as np
 
+from rhs_isac_ros.model import geometry
 from rhs_isac_ros.model.arrays import (
     adjoint,
     blocks,
@@ -41,12 +42,6 @@ from rhs_isac_ros.model.elements import (
     with_direct_errors,
 )
 from rhs_isac_ros.model.gaussian import covariance_root
-from rhs_isac_ros.model.geometry import (
-    element_positions,
-    frame_times_s,
-    subband_frequencies_hz,
-    velocity_std_mps,
-)
 from rhs_isac_ros.model.impairments import draw_impairments, nuisance_of
 from rhs_isac_ros.model.los import Waves, boresight_axes, direct_gain, draw_blocked, los_waves
 from rhs_isac_ros.model.multipath import (
@@ -153,7 +148,7 @@ def simulate_received(
 
 def _moving(scenario: Scenario, states: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Check states, and draw the declared velocities of positions."""
-    states, std = checked_states(states), velocity_std_mps(scenario)
+    states, std = checked_states(states), geometry.velocity_std_mps(scenario)
     if states.shape[1] > 3 or not std.any():
         return states
     return np.hstack([states, std * rng.standard_normal(states.shape)])
@@ -166,7 +161,7 @@ def _direct(scenario: Scenario, states: np.ndarray, band: int, blocked: np.ndarr
         return direct_signal(direct_gain(scenario, states, band, blocked), radiation)
     frames = radiation.reshape(scenario.n_subbands, scenario.n_frames, -1)
     signals = np.empty((len(states), *frames.shape[:2]), complex)
-    for frame, time_s in enumerate(frame_times_s(scenario)[band].tolist()):
+    for frame, time_s in enumerate(geometry.frame_times_s(scenario)[band].tolist()):
         signals[:, :, frame] = direct_signal(direct_gain(
             scenario, states[:, :3], band, blocked, time_s * states[:, 3:]), frames[:, frame])
     return signals.reshape(len(states), -1)
@@ -451,8 +446,8 @@ class ElementSums:
         # T_i divided by the frequency, complex128 [N_B, N_SB, N_E, F].
         self._frames = np.ascontiguousarray(
             np.swapaxes(radiation.reshape(shape), 2, 3)
-            / subband_frequencies_hz(scenario)[..., None, None])
-        self._elements = element_positions(scenario)
+            / geometry.subband_frequencies_hz(scenario)[..., None, None])
+        self._elements = geometry.element_positions(scenario)
         # The A axes along which elements are not at 0.
         self._axes = np.flatnonzero(self._elements.any(axis=0))
         self._n_sums = len(self._axes) + len(self._boresight_axes)
@@ -489,7 +484,7 @@ class ElementSums:
         terms = np.empty((n, n_terms, n_subbands, n_same), complex)
         for band, first in np.ndindex(n_bands, n_frames // n_same):
             same = slice(first, first + n_same)
-            times_s = frame_times_s(self._scenario)[band, same]
+            times_s = geometry.frame_times_s(self._scenario)[band, same]
             places = states[:, :3] + times_s[0] * states[:, 3:]
             waves = los_waves(self._scenario, places, [band], slopes=varies)
             self._add_up(waves, self._frames[[band], ..., same], moments[

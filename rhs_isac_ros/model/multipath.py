@@ -12,15 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model import geometry
 from rhs_isac_ros.model.arrays import adjoint, blocks, gauss_legendre, read_only
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.gain_pattern import GainPattern
-from rhs_isac_ros.model.geometry import (
-    element_intervals_m,
-    element_normals,
-    element_positions,
-    frame_lags_s,
-)
 from rhs_isac_ros.model.hall import MultipathEstimate
 from rhs_isac_ros.model.scenario import Scenario
 
@@ -184,9 +179,9 @@ def _lattice(scenario: Scenario) -> np.ndarray:
 @functools.lru_cache(maxsize=16)
 def _of_positions(scenario: Scenario) -> np.ndarray:
     """Compute V_i for elements at any positions, complex128 [N_B, N_E, N_E], read-only."""
-    elements = element_positions(scenario)
+    elements = geometry.element_positions(scenario)
     # Elements that face along one axis have equal gains.
-    facing = element_normals(scenario)[:1 if scenario.element_normals is None else None]
+    facing = geometry.element_normals(scenario)[:1 if scenario.element_normals is None else None]
     matrices = np.zeros((scenario.n_bands, len(elements), len(elements)), complex)
     extent_m = np.linalg.norm(np.ptp(elements, axis=0))
     for band, matrix in enumerate(matrices):
@@ -232,7 +227,8 @@ def _plane_waves(
     """Yield plane waves in blocks of elevations, sized for `n_draws` amplitudes per wave."""
     wavenumber = 2 * np.pi * scenario.center_frequencies_hz[band] / SPEED_OF_LIGHT_MPS
     columns, rows = (np.arange(n) * interval_m for n, interval_m in zip(
-        (scenario.n_columns, scenario.n_rows), element_intervals_m(scenario), strict=True))
+        (scenario.n_columns, scenario.n_rows), geometry.element_intervals_m(scenario),
+        strict=True))
     # The elevation affects the phases along both axes.
     lengths = columns[-1], math.hypot(columns[-1], rows[-1])
     (azimuth, azimuth_weights), (elevations, elevation_weights) = (
@@ -324,7 +320,7 @@ def measurement_correlation(scenario: Scenario) -> np.ndarray:
     subbands, frames = np.arange(scenario.n_subbands), np.arange(scenario.n_frames)
     over_frequency = frequency_correlation(
         scenario, (subbands[:, None] - subbands) * scenario.spacing_hz)
-    over_time = time_correlation(scenario, frame_lags_s(scenario))[
+    over_time = time_correlation(scenario, geometry.frame_lags_s(scenario))[
         :, np.abs(frames[:, None] - frames)]
     return read_only(np.kron(over_frequency, over_time))
 

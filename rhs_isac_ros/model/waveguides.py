@@ -14,12 +14,8 @@ import dataclasses
 
 import numpy as np
 
+from rhs_isac_ros.model import geometry
 from rhs_isac_ros.model.constants import NEPERS_PER_DB, SPEED_OF_LIGHT_MPS
-from rhs_isac_ros.model.geometry import (
-    element_intervals_m,
-    element_positions,
-    subband_frequencies_hz,
-)
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.support.fields import Field, finite
 
@@ -124,18 +120,18 @@ def board_of_guides(scenario: Scenario, loss_db_per_m: float = 3.0, across: floa
     """
     if scenario.element_positions_m is not None:
         raise ValueError('element_positions_m: not null, expected a grid of elements')
-    elements, shape = element_positions(scenario), (scenario.n_rows, scenario.n_columns)
+    elements, shape = geometry.element_positions(scenario), (scenario.n_rows, scenario.n_columns)
     if scenario.n_feeds > shape[0]:
         raise ValueError(f'n_feeds: {scenario.n_feeds}, expected at most one for each of '
                          f'{shape[0]} rows of elements')
-    spacing, width = element_intervals_m(scenario).tolist()
+    spacing, width = geometry.element_intervals_m(scenario).tolist()
     guides = Guides(width, width / 3, (shape[1] + 1) * spacing, scenario.refractive_index,
                     loss_db_per_m)
     along = elements[:, 1] - elements[:, 1].min() + spacing
     rows = np.arange(shape[0])
     arrays = admittances(
         # The ends of a band suffice, because the transfer is interpolated.
-        np.unique(subband_frequencies_hz(scenario)[:, [0, -1]]), guides, along, elements,
+        np.unique(geometry.subband_frequencies_hz(scenario)[:, [0, -1]]), guides, along, elements,
         np.repeat(rows, shape[1]), rows * scenario.n_feeds // shape[0], across)
     conductance = air_admittance(min(scenario.center_frequencies_hz), np.zeros(3)).real
     own = np.diagonal(arrays['y_ss'], axis1=1, axis2=2).real + 0.05 * conductance

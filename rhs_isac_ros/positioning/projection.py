@@ -17,14 +17,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, MeasurementModel, Scenario
+from rhs_isac_ros.model import SPEED_OF_LIGHT_MPS, MeasurementModel, Scenario, geometry
 from rhs_isac_ros.model.arrays import adjoint, multiply_rows
-from rhs_isac_ros.model.geometry import (
-    element_positions,
-    polar_bounds,
-    subband_frequencies_hz,
-    to_positions,
-)
 from rhs_isac_ros.model.impairments import nuisance_of
 from rhs_isac_ros.support import streams
 
@@ -70,8 +64,8 @@ class ProjectedModel(MeasurementModel):
         self.root = np.swapaxes(self.whitener, 1, 2) / n_nodes
         projector = adjoint(full.expand(adjoint(full.combined_whitener) @ basis))
         frames = full.radiation.reshape(*full.radiation.shape[:1], len(weights), -1)
-        frames = frames / subband_frequencies_hz(full.scenario)[..., None]
-        frequencies = subband_frequencies_hz(self.scenario)
+        frames = frames / geometry.subband_frequencies_hz(full.scenario)[..., None]
+        frequencies = geometry.subband_frequencies_hz(self.scenario)
         radiation = np.zeros((n_bands, n_nodes, n_columns, full.scenario.n_elements), complex)
         for node, column in enumerate(weights.T):
             rows = (frames * column[:, None]).reshape(full.radiation.shape)
@@ -131,7 +125,7 @@ def at_ranges(model: MeasurementModel, ranges_m: np.ndarray, points: np.ndarray,
     if isinstance(model, ProjectedModel):
         few = points[::-(-len(points) // len(streams.unit_points()))]
         full = model.full
-        basis = basis_of([white_means(full, to_positions(few))])
+        basis = basis_of([white_means(full, geometry.to_positions(few))])
     return [ProjectedModel(full, basis, np.full(2, range_m), max_error)
             for range_m in ranges_m.tolist()]
 
@@ -162,11 +156,11 @@ def interpolation(scenario: Scenario, ends_m: np.ndarray | None = None,
 
     They hold for users at distances between `ends_m`, by default in the region of interest.
     """
-    edge_m = np.linalg.norm(element_positions(scenario), axis=1).max()
+    edge_m = np.linalg.norm(geometry.element_positions(scenario), axis=1).max()
     if ends_m is None:
-        ends_m = polar_bounds(scenario.roi_bounds_m)[:, 0]
+        ends_m = geometry.polar_bounds(scenario.roi_bounds_m)[:, 0]
     delays = (ends_m + [-edge_m, edge_m]) / SPEED_OF_LIGHT_MPS
-    offsets_hz = (subband_frequencies_hz(scenario) - scenario.center_frequencies_hz[0])[0]
+    offsets_hz = (geometry.subband_frequencies_hz(scenario) - scenario.center_frequencies_hz[0])[0]
     turns = np.ptp(offsets_hz) * np.ptp(delays)
     n_delays = _DELAYS + int(_DELAYS_PER_TURN * turns)
     # The error is largest at the ends of the interval.

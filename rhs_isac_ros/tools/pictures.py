@@ -8,13 +8,7 @@ from typing import Any
 import numpy as np
 
 from rhs_isac_ros.link import BeamPattern
-from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.geometry import (
-    element_normals,
-    element_positions,
-    feed_positions,
-    surface_sides_m,
-)
+from rhs_isac_ros.model import Scenario, geometry
 from rhs_isac_ros.monitoring import shapes
 from rhs_isac_ros.monitoring.cycle_log import CompleteCycle
 from rhs_isac_ros.monitoring.network_state import SceneState, SceneUser
@@ -231,25 +225,25 @@ def _draw_user(axes: Any, plane: list[int], user: SceneUser) -> None:
 def _draw_surface(axes: Any, message: m.RhsConfiguration | None, scenario: Scenario) -> None:
     """Draw the configuration of the surface from the front: y to the right, z up."""
     shape = scenario.n_rows, scenario.n_columns
-    half_y_cm, half_z_cm = 50 * surface_sides_m(scenario)
+    half_y_cm, half_z_cm = 50 * geometry.surface_sides_m(scenario)
     tunings = np.full(shape, np.nan) if message is None else message.analog.mean(axis=0)
     if scenario.element_positions_m is None:
         image = axes.imshow(
             tunings.reshape(shape), origin='lower', vmin=0, vmax=1,
             extent=(-half_y_cm, half_y_cm, -half_z_cm, half_z_cm))
     else:
-        image = axes.scatter(*(100 * element_positions(scenario)[:, 1:]).T, s=12,
+        image = axes.scatter(*(100 * geometry.element_positions(scenario)[:, 1:]).T, s=12,
                              c=tunings.ravel(), vmin=0, vmax=1)
         if scenario.element_normals is not None:
-            axes.quiver(*(100 * element_positions(scenario)[:, 1:]).T,
-                        *element_normals(scenario)[:, 1:].T, color='grey', width=0.004)
+            axes.quiver(*(100 * geometry.element_positions(scenario)[:, 1:]).T,
+                        *geometry.element_normals(scenario)[:, 1:].T, color='grey', width=0.004)
         axes.set(aspect='equal')
-    axes.plot(*(100 * feed_positions(scenario)[:, 1:]).T, 'D', color='white',
+    axes.plot(*(100 * geometry.feed_positions(scenario)[:, 1:]).T, 'D', color='white',
               markeredgecolor='black', markersize=4)
     label, text = 'tuning', 'not known yet'
     if message is not None and scenario.board.declared:
         label += ' (circles: modulus)'
-        axes.scatter(*(100 * element_positions(scenario)[:, 1:]).T, facecolors='none',
+        axes.scatter(*(100 * geometry.element_positions(scenario)[:, 1:]).T, facecolors='none',
                      s=30 * shapes.moduli(scenario, message.analog, message.band)**2,
                      edgecolors='white', linewidths=0.7)
     axes.figure.colorbar(image, ax=axes, location='bottom', label=label, shrink=0.8,

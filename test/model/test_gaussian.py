@@ -5,12 +5,7 @@ import pytest
 from scipy.special import ive, logsumexp
 from scipy.stats import norm
 
-from rhs_isac_ros.model.gaussian import (
-    log_bessel,
-    log_evidence_of_level,
-    marginalise,
-    quadratic_form,
-)
+from rhs_isac_ros.model import gaussian
 
 N = 6
 
@@ -21,7 +16,7 @@ def test_quadratic_form_is_twice_the_real_part_of_the_products():
     # The memory layout does not matter.
     for layout in (whitened, np.asfortranarray(whitened)):
         np.testing.assert_allclose(
-            quadratic_form(layout), expected, rtol=1e-12, atol=1e-12)
+            gaussian.quadratic_form(layout), expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.fixture(params=[1, 2, 5], ids='{} parameters'.format)
@@ -35,7 +30,7 @@ def joint(request):
 
 def test_the_marginal_covariance_is_the_block_of_the_joint_inverse(joint):
     information, gradient = joint
-    marginal = marginalise(information, gradient)
+    marginal = gaussian.marginalise(information, gradient)
     inverse = np.linalg.inv(information)
     np.testing.assert_allclose(
         np.linalg.inv(marginal.information), inverse[:, :3, :3], rtol=1e-8)
@@ -46,7 +41,7 @@ def test_the_marginal_covariance_is_the_block_of_the_joint_inverse(joint):
 def test_the_regression_follows_the_maximum_over_the_parameters(joint):
     """The gradient in the parameters vanishes wherever the other unknowns are."""
     information, gradient = joint
-    marginal = marginalise(information, gradient)
+    marginal = gaussian.marginalise(information, gradient)
     fixed = np.random.default_rng(9).normal(size=(N, 3))
     others = marginal.offset + np.einsum('nqp,np->nq', marginal.regression, fixed)
     both = np.concatenate([fixed, others], axis=1)
@@ -64,7 +59,7 @@ def test_the_volume_is_the_integral_over_the_parameters(n):
     roots = rng.normal(size=(2, n + 2, n + 2))
     information = roots @ np.swapaxes(roots, 1, 2) + np.eye(n + 2)
     gradient = rng.normal(size=(2, n + 2))
-    marginal = marginalise(information, gradient, n)
+    marginal = gaussian.marginalise(information, gradient, n)
     # Standard deviations do not exceed 1.
     axis = np.linspace(-12, 12, 961)
     others = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
@@ -84,7 +79,7 @@ def test_the_volume_is_the_integral_over_the_parameters(n):
 
 def test_without_parameters_nothing_changes():
     information, gradient = np.array([[[2.0, 1.0], [1.0, 3.0]]]), np.array([[4.0, 5.0]])
-    marginal = marginalise(information, gradient, 2)
+    marginal = gaussian.marginalise(information, gradient, 2)
     np.testing.assert_array_equal(marginal.information, information)
     np.testing.assert_array_equal(marginal.gradient, gradient)
     assert (marginal.regression.shape, marginal.offset.shape) == ((1, 0, 2), (1, 0))
@@ -100,10 +95,10 @@ def test_the_evidence_of_a_level_is_the_average_over_it(median_db):
         -energy[:, None] * np.exp(-level) - n * level + norm(median_db, std_db).logpdf(db),
         axis=1) + np.log(db[1] - db[0])
     np.testing.assert_allclose(
-        log_evidence_of_level(energy, n, std_db, median_db), expected, atol=0.05)
+        gaussian.log_evidence_of_level(energy, n, std_db, median_db), expected, atol=0.05)
 
 
 def test_bessel_function():
     argument = np.concatenate([np.linspace(0, 5, 100), np.geomspace(5, 1e4, 50)])
     expected = argument + np.log(ive(0, argument))
-    np.testing.assert_allclose(log_bessel(argument), expected, rtol=0, atol=0.04)
+    np.testing.assert_allclose(gaussian.log_bessel(argument), expected, rtol=0, atol=0.04)

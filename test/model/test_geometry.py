@@ -7,14 +7,6 @@ import pytest
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model import geometry as g
-from rhs_isac_ros.model.geometry import (
-    jacobian,
-    polar_bounds,
-    polar_derivative,
-    region_information,
-    to_polar,
-    to_positions,
-)
 
 
 def test_positions_and_frequencies_match_the_vectors(case):
@@ -97,35 +89,35 @@ def positions_in_front(n, seed):
 
 def test_the_conversions_are_inverse_to_each_other():
     positions = positions_in_front(60, 1).reshape(5, 4, 3, 3)
-    np.testing.assert_allclose(to_positions(to_polar(positions)), positions, rtol=1e-10)
+    np.testing.assert_allclose(g.to_positions(g.to_polar(positions)), positions, rtol=1e-10)
 
 
 def test_directions_outside_the_unit_circle_have_x_0():
-    positions = to_positions(np.array([[2.0, 0.9, 0.9], [2.0, 1.0, 0.0]]))
+    positions = g.to_positions(np.array([[2.0, 0.9, 0.9], [2.0, 1.0, 0.0]]))
     np.testing.assert_allclose(positions, [[0, 1.8, 1.8], [0, 2, 0]], atol=1e-14)
 
 
 def test_jacobian_matches_finite_differences():
-    points, step = to_polar(positions_in_front(20, 2)), 1e-6
-    matrices = jacobian(points)
+    points, step = g.to_polar(positions_in_front(20, 2)), 1e-6
+    matrices = g.jacobian(points)
     assert matrices.shape == (20, 3, 3)
     np.testing.assert_allclose(
-        polar_derivative(points) @ matrices, np.tile(np.eye(3), (20, 1, 1)), atol=1e-10)
+        g.polar_derivative(points) @ matrices, np.tile(np.eye(3), (20, 1, 1)), atol=1e-10)
     for a in range(3):
         shift = step * np.eye(3)[a]
-        difference = (to_positions(points + shift) - to_positions(points - shift)) / (2 * step)
+        difference = (g.to_positions(points + shift) - g.to_positions(points - shift)) / (2 * step)
         np.testing.assert_allclose(matrices[:, :, a], difference, rtol=1e-6, atol=1e-6)
 
 
 def test_polar_bounds_are_the_extrema_inside():
     bounds = np.array([[6.0, -4.0, 0.5], [14.0, 4.0, 1.0]])
     axes = np.linspace(*bounds, 41).T
-    points = to_polar(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3))
-    low, high = polar_bounds(bounds)
+    points = g.to_polar(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3))
+    low, high = g.polar_bounds(bounds)
     np.testing.assert_allclose(low, points.min(axis=0), rtol=1e-12)
     np.testing.assert_allclose(high, points.max(axis=0), rtol=1e-12)
 
 
 def test_the_prior_of_the_region_has_its_variances(small):
-    np.testing.assert_allclose(np.linalg.inv(region_information(small.scenario)),
+    np.testing.assert_allclose(np.linalg.inv(g.region_information(small.scenario)),
                                np.diag(np.square(small.scenario.roi_size_m) / 12))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rhs_isac_ros.codebook.unoptimised import random_codebook
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import Scenario, geometry
 from rhs_isac_ros.positioning import make_estimator, projection
 from rhs_isac_ros.system import System
 
@@ -85,7 +85,7 @@ def test_gains_are_interpolated_from_few_frequencies(ends_m):
     nodes = dataclasses.replace(WIDE, n_subbands=n_nodes,
                                 subband_spacing_hz=WIDE.bandwidth_hz / n_nodes)
     frequencies_hz, nodes_hz = (
-        projection.subband_frequencies_hz(one)[0] for one in (WIDE, nodes))
+        geometry.subband_frequencies_hz(one)[0] for one in (WIDE, nodes))
     for distance_m in ends_m if ends_m is not None else (5.2, 11.0):
         delay_s = distance_m / projection.SPEED_OF_LIGHT_MPS
         gains, at_nodes = (np.exp(-2j * np.pi * delay_s * one)
