@@ -8,6 +8,8 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+from rhs_isac_ros.support.plugins import PluginError, trace_of
+
 
 def on_end_signals(handler: Callable[[int, Any], Any] | signal.Handlers) -> None:
     """Install a handler for SIGINT, SIGTERM and SIGHUP, which end a command.
@@ -33,12 +35,16 @@ def import_main(module: str) -> Callable[[], int]:
 
 
 def print_error(error: object, program: str = '') -> None:
-    """Print an error to stderr after the prefix `program`, by default the name of this command."""
+    """Print an error to stderr after the prefix `program`, by default the name of this command.
+
+    The traceback of the code of a plug-in follows.
+    """
     if not program:
         spec = getattr(sys.modules['__main__'], '__spec__', None)
         program = (f'python3 -m {spec.name.removesuffix(".__main__")}' if spec
                    else os.path.basename(sys.argv[0]))
-    print(f'{program}: error: {error}', file=sys.stderr)
+    trace = trace_of(error.__cause__) if isinstance(error, PluginError) else ''
+    print(f'{program}: error: {error}{trace}', file=sys.stderr)
 
 
 def exit_code_of(

@@ -6,12 +6,15 @@ in place of a name also has such a name, under which this process finds it again
 
 import contextlib
 import functools
+import importlib
+import itertools
 import sys
 import traceback
 import weakref
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from operator import attrgetter
+from pathlib import Path
 from typing import Any, TypeVar
 
 # Groups of entry points; the page `extending` of the documentation specifies their objects.
@@ -28,9 +31,19 @@ class PluginError(ValueError):
     """A plug-in is not installed, cannot be loaded, or does not have the required interface."""
 
 
+def _foreign(error: BaseException) -> list[traceback.FrameSummary]:
+    """Return the frames of an error from the first one of other code than this and `importlib`."""
+    own = str(Path(__file__).parents[1]), str(Path(importlib.__file__).parent), '<frozen'
+    return [*itertools.dropwhile(lambda frame: frame.filename.startswith(own),
+                                 traceback.extract_tb(error.__traceback__))]
+
+
 def trace_of(error: BaseException | None) -> str:
-    """Return lines with the traceback of an error, which continue a text; '' if there is none."""
-    return '\n' + ''.join(traceback.format_exception(error)).rstrip() if error else ''
+    """Return the traceback of an error in other code, as lines that follow a text, or ''."""
+    if error is None or not (frames := _foreign(error)):
+        return ''
+    lines = [*traceback.format_list(frames), *traceback.format_exception_only(error)]
+    return '\nTraceback (most recent call last):\n' + ''.join(lines).rstrip()
 
 
 @contextlib.contextmanager

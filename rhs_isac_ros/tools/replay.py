@@ -4,6 +4,7 @@ With ``--publish``, it passes them to running nodes instead; see `republish`.
 """
 
 import argparse
+import functools
 import posixpath
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,6 +28,7 @@ from rhs_isac_ros.positioning import (
     Site,
     fuse,
 )
+from rhs_isac_ros.positioning.estimate import estimate_of
 from rhs_isac_ros.positioning.site import share_left_out
 from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
@@ -239,7 +241,7 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
         estimators = {codebook_id: kind.create(System(scenario, codebook, surface), **accepted)
                       for codebook_id, codebook in codebooks.items()}
         rows.append(_row(kind.name, recording, locate(recording, alone({
-            key: one.estimate for key, one in estimators.items()}))))
+            key: functools.partial(estimate_of, one) for key, one in estimators.items()}))))
         if options.track and kind.uses_tracks:
             rows.append(_row('track', recording, locate(recording, tracked(
                 estimators, options.track_speed or Motion.speed_mps))))

@@ -5,6 +5,7 @@ import re
 import pytest
 
 from rhs_isac_ros.support import plugins
+from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.plugins import PluginError
 
 # A group that no installed package has.
@@ -51,6 +52,22 @@ def test_the_error_for_a_failed_call_names_the_entry_point(install):
         plugins.make(GROUP, 'stroll', tuple)
     with pytest.raises(PluginError, match='failed: TypeError: .* positional argument'):
         plugins.make(GROUP, 'stroll', tuple, 1)
+
+
+def test_a_traceback_begins_in_the_code_of_the_plug_in(install, capsys):
+    install('strolls', 'def stroll(): return pace()\ndef pace(): return {}["speed"]',
+            {GROUP: {'stroll': 'stroll', 'gone': 'gone'}})
+
+    def made(name):
+        plugins.make(GROUP, name, tuple)
+    assert exit_code_of(lambda: made('stroll'), (PluginError,), 'walk') == 2
+    first, head, *frames, last = capsys.readouterr().err.splitlines()
+    assert first.startswith('walk: error: entry point') and first.endswith("KeyError: 'speed'")
+    assert head == 'Traceback (most recent call last):' and last == "KeyError: 'speed'"
+    assert frames[0].endswith('strolls.py", line 1, in stroll')
+    # No code of the plug-in has been called.
+    assert exit_code_of(lambda: made('gone'), (PluginError,), 'walk') == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 def test_the_error_for_a_duplicate_name_names_both_packages(install):
