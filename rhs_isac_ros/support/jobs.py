@@ -87,7 +87,7 @@ def sources_of(*uses: Any) -> str:
         # If a module is loaded again, files are read again only if this code differs. They do not
         # contain what an enclosing function binds.
         texts += [_definition(
-            (inspect.unwrap(member).__code__, inspect.getclosurevars(member).nonlocals)
+            (inspect.unwrap(member).__code__, _bound(member))
             if inspect.isfunction(member) else member, set()) for name, member in (
                 vars(one).items() if isinstance(one, type) else [('', one)])
             if inspect.isfunction(member) or name[:1] not in ('', '_')]
@@ -139,12 +139,21 @@ def _definition(value: Any, seen: set[int]) -> Any:
             if inspect.isfunction(member) or not name.startswith('__')}), seen)
     if not is_function:
         return _definition((kind, getattr(value, '__dict__', {})), seen)
-    parts = (value.__qualname__, inspect.getclosurevars(value).nonlocals)
+    parts = (value.__qualname__, _bound(value))
     if Path(value.__code__.co_filename).is_file():
         return _definition((*parts, value.__code__.co_firstlineno), seen)
     return _definition((*parts, value.__code__, value.__defaults__, value.__kwdefaults__, {
         name: value.__globals__[name] for name in _names(value.__code__)
         if name in value.__globals__}), seen)
+
+
+def _bound(function: types.FunctionType) -> dict[str, Any]:
+    """Return the values of enclosing functions that a function uses, without those not yet set."""
+    found = {}
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        with contextlib.suppress(ValueError):
+            found[name] = cell.cell_contents
+    return found
 
 
 def _names(code: types.CodeType) -> list[str]:

@@ -229,7 +229,14 @@ def test_values_bound_to_a_function_are_sources():
 
         def __call__(self):
             return {'value': self.value}
-    for wrap in (of, lambda value: functools.partial(print, end=value), Work):
+
+    def of_two(value):
+        def work():
+            return {'value': value, 'other': not_yet}
+        if False:
+            not_yet = 1
+        return work
+    for wrap in (of, lambda value: functools.partial(print, end=value), Work, of_two):
         one, other, same = (jobs_module.sources_of(wrap(value)) for value in (
             np.arange(2000), np.arange(1, 2001), np.arange(2000)))
         assert one == same != other
