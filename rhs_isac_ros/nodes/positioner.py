@@ -117,7 +117,7 @@ class PositionerNode(LocatingNode[Positioner]):
                     functools.partial(build_estimator, codebook, make, time.perf_counter),
                     self._on_estimator)
             case events.PrepareEstimator(estimator):
-                self._worker.run(functools.partial(_prepared, estimator), self._on_prepared)
+                self._worker.run(estimator.prepare, lambda _: None)
             case _:
                 super().execute(action)
 
@@ -125,20 +125,6 @@ class PositionerNode(LocatingNode[Positioner]):
         self.dispatch(event)
         if event.estimator is not None:
             self.subscribe()
-
-    def _on_prepared(self, error: plugins.PluginError | None) -> None:
-        with self.noting():
-            if error:
-                raise error
-
-
-def _prepared(estimator: positioning.SearchEstimator) -> plugins.PluginError | None:
-    """Prepare an estimator; return the failure of a plug-in, with which it cannot be prepared."""
-    try:
-        estimator.prepare()
-    except plugins.PluginError as error:
-        return error
-    return None
 
 
 main = entry('positioner', lambda: [PositionerNode()])

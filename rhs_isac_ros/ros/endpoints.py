@@ -9,6 +9,7 @@ node then runs without it, logs the refusal, and reports it in its diagnostics.
 """
 
 import collections
+import contextlib
 import copy
 import functools
 import inspect
@@ -33,6 +34,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import convert, topics
+from rhs_isac_ros.support.plugins import PluginError, trace_of
 from rhs_isac_ros.support.state_log import Line, StateLog
 
 
@@ -100,9 +102,20 @@ def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> 
 def steady_timer(node: Node, period_s: float, callback: Callable[[], float | None]) -> Timer:
     """Create a running timer on the steady clock; `callback` may return a new period [s]."""
     def call() -> None:
-        set_period(timer, callback())
+        with surviving(node):
+            set_period(timer, callback())
     timer = node.create_timer(period_s, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
     return timer
+
+
+@contextlib.contextmanager
+def surviving(node: Node) -> Iterator[None]:
+    """Let a node log the failure of a plug-in in a block, and live on."""
+    try:
+        yield
+    except PluginError as error:
+        text = f'plug-in: {error}'
+        journal(node).event(text, text + trace_of(error.__cause__))
 
 
 def set_period(timer: Timer, period_s: float | None) -> None:
@@ -369,7 +382,8 @@ class BackgroundWorker:
     def run(self, job: Callable[[], _Result], on_result: Callable[[_Result], None]) -> None:
         """Queue a job; the thread that spins the node passes the result to `on_result`.
 
-        That thread also raises exceptions of the job.
+        That thread also raises exceptions of the job, except for failures of plug-ins, which it
+        logs.
         """
         def hand_over(future: Future[_Result]) -> None:
             self._done.append((future, on_result))
@@ -393,4 +407,5 @@ class BackgroundWorker:
         self._timer.cancel()
         while self._done:
             future, on_result = self._done.popleft()
-            on_result(future.result())
+            with surviving(self._node):
+                on_result(future.result())
