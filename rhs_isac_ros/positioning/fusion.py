@@ -52,13 +52,17 @@ class _Limits(NamedTuple):
     """Numbers that trade the speed of a product for its accuracy; weights are logarithms."""
 
     # Products below the best by more than this, and any beyond a number, are discarded: by the
-    # overlap of their sheets' moments, and after a Gauss-Newton step.
+    # overlap of their sheets' moments, and after a Gauss-Newton step. Equal products, such as
+    # those of sheets at regular distances, must not be discarded.
     margins: tuple[float, float] = (25.0, 12.0)
-    products: tuple[int, int] = (4000, 512)
-    # Numbers of samples of a sheet, of a part of a product, and of all parts together that are
-    # computed at a time.
+    products: int = 4000
+    # Largest number of Gaussians of a posterior.
+    components: int = 512
+    # Numbers of samples of a sheet, smallest and largest one of a part of a product, and number of
+    # all parts together that are computed at a time. All products have the same few points, so
+    # that their errors do not average out.
     of_sheet: int = 64
-    of_product: int = 256
+    of_product: tuple[int, int] = (64, 256)
     samples: int = 1 << 13
     # Information of a uniform prior in the region that narrows Gaussians, as a share of it.
     narrowing: float = 0.25
@@ -258,12 +262,12 @@ class _Products(NamedTuple):
         one, other = (mixture._replace(
             means=mixture.means[:, free], covariances=mixture.covariances[:, free][:, :, free])
             for mixture in (self.moments, last))
-        pairs = one.heaviest_pairs(other, _LIMITS.products[0], _LIMITS.margins[0])
+        pairs = one.heaviest_pairs(other, _LIMITS.products, _LIMITS.margins[0])
         found = _Products(
             np.column_stack([self.rows[pairs[0]], pairs[1]]),
             select(self.moments, pairs[0]).updated(select(last, pairs[1])))
         return found.climbed(factors, bounds_m).heaviest(
-            _LIMITS.products[1], _LIMITS.margins[1], factors)
+            _LIMITS.products, _LIMITS.margins[1], factors)
 
     def heaviest(self, number: int, margin: float, factors: Sequence[_Factor]) -> '_Products':
         """Return the heaviest products, and that of all constants if there are more factors."""
@@ -370,7 +374,7 @@ class _Products(NamedTuple):
     def mixture(self, factors: Sequence[_Factor]) -> Mixture:
         """Return the normalised density, with the covariance that errors of poses cause."""
         constant = self.constant(factors)
-        mixture = self.moments.widened(-constant).reduce(_LIMITS.products[1]).normalised()
+        mixture = self.moments.widened(-constant).reduce(_LIMITS.components).normalised()
         return mixture.shared(np.tensordot(self.moments.probabilities, constant, axes=1))
 
     def constant(self, factors: Sequence[_Factor]) -> np.ndarray:
@@ -410,7 +414,7 @@ class _Parts(NamedTuple):
     def sampled(self, products: _Products, factors: Sequence[_Factor], bounds_m: np.ndarray
                 ) -> _Samples:
         """Draw samples of products in the boxes."""
-        n = min(max(_LIMITS.samples // len(self.owners), 16), _LIMITS.of_product)
+        n = int(np.clip(_LIMITS.samples // len(self.owners), *_LIMITS.of_product))
         normal = standard_normal(1 << (n.bit_length() - 1))
         positions = np.empty((len(self.owners), *normal.shape))
         logs, beyond = np.empty(positions.shape[:2]), np.empty_like(self.starts_m)

@@ -19,6 +19,7 @@ EXACT = (0.0, 0.0)
 FRONT = Pose(uncertainty=EXACT)
 SIDE = Pose((10.0, -10.0, 0.0), (0.0, 0.0, 1.0, 1.0), EXACT)
 OPPOSITE = Pose((20.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), EXACT)
+HIGH = Pose((20.0, 0.0, 2.0), (0.0, 0.0, 1.0, 0.0), EXACT)
 PLACE = np.array([8.0, 1.0, 0.2])
 # Standard deviations of range [m] and direction cosines of a mode.
 STD = np.array([0.01, 0.05, 0.02])
@@ -125,6 +126,17 @@ def test_only_modes_that_agree_remain():
     assert_moments(fuse(sightings, BOUNDS), *integrated(sightings))
 
 
+def test_many_modes_at_regular_distances_have_the_moments_of_all_their_products():
+    """Of 1728 similar products, none may be left out or have too few samples."""
+    std, steps_m = np.array([0.02, 0.3, 0.3]), np.arange(-6, 6)[:, None]
+    sightings = []
+    for pose, step_m in ((FRONT, 0.1), (SIDE, 0.12), (HIGH, 0.09)):
+        sight = PLACE - pose.origin
+        sightings.append(sheets(pose, PLACE + step_m * steps_m * sight / np.linalg.norm(sight),
+                                np.zeros(12), std))
+    assert_moments(fuse(sightings, BOUNDS), *integrated(sightings, n=100_000, std=std), 0.1)
+
+
 def test_the_order_of_the_surfaces_does_not_matter():
     sightings = [sheets(pose, [PLACE, PLACE + offset], [0.0, 0.3]) for pose, offset in (
         (FRONT, [0.6, 0.1, 0.0]), (SIDE, [0.0, 0.5, 0.1]), (OPPOSITE, [0.3, 0.1, 0.1]))]
@@ -133,7 +145,6 @@ def test_the_order_of_the_surfaces_does_not_matter():
     np.testing.assert_allclose(one.log_agreement, other.log_agreement, atol=0.02)
 
 
-HIGH = Pose((20.0, 0.0, 2.0), (0.0, 0.0, 1.0, 0.0), EXACT)
 TURNED = Pose((5.0, -75**0.5, 0.0), (0.0, 0.0, 0.5, 0.75**0.5), EXACT)
 
 
