@@ -360,9 +360,11 @@ class Channel(Role):
         if isinstance(event, m.Pilot):
             return m.derive(m.FeedSignals, event, stamp_ns=event.stamp_ns,
                             user_instance=event.sender, signals=feeds)
+        # A plug-in may have failed when the beam arrived.
+        rate_bps = self._rate_bps(cycle) if cycle.rate_bps is None else cycle.rate_bps
+        assert rate_bps is not None
         # Data in excess of the true capacity are lost.
-        assert cycle.rate_bps is not None
-        bits = min(event.bits, cycle.rate_bps * event.duration_s // 1)
+        bits = min(event.bits, rate_bps * event.duration_s // 1)
         return dataclasses.replace(event, stage=m.Stage.DELIVERED, bits=bits)
 
     def _response(self, band: int) -> Response:

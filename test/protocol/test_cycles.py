@@ -2,12 +2,14 @@
 
 import dataclasses
 import functools
+import itertools
 
 import numpy as np
 import pytest
 from in_memory_network import Fault, Network
 
 from rhs_isac_ros.model import Pose, Scenario, mobility
+from rhs_isac_ros.model.elementwise import Paper
 from rhs_isac_ros.model.geometry import frames_s
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.protocol import messages as m
@@ -182,3 +184,39 @@ def test_a_cycle_of_table_1_finds_the_user(shipped, table1_estimator):
         assert estimate.estimator == 'bayes'
         assert report.expected_bps == pytest.approx(report.actual_bps, rel=0.05)
         assert 0 <= report.loss_percent < 1
+
+
+def test_a_plug_in_that_fails_once_at_any_call_costs_at_most_one_cycle(random_beams):
+    calls, fails_at = itertools.count(1), set()
+
+    def call():
+        if next(calls) in fails_at:
+            raise RuntimeError('short circuit')
+
+    class Own(Paper):
+        kind = 'fragile'
+
+        def coefficients(self, ports, tunings):
+            call()
+            return super().coefficients(ports, tunings)
+
+    class Still:
+        def state(self, now_s):
+            call()
+            return np.array([9.0, 1.0, 0.3]), np.zeros(3)
+    scenario = Scenario(center_frequencies_hz=(2.5e9,), n_subbands=1, n_frames=2, n_feeds=1,
+                        elements_per_side=4, board=Own)
+    codebook = random_beams(scenario, np.random.default_rng(0))
+    net = Network(scenario, codebook, {1: Still()})
+    net.run_cycles(1)
+    begin = next(calls)
+    net.run_cycles(1)
+    n_calls = next(calls) - begin
+    assert n_calls > 3
+    for number in range(1, n_calls):
+        fails_at.add(next(calls) + number)
+        net.run_cycles(2)
+        faults = sum(count.get('plugin_fault', 0) for count in net.counters().values())
+        assert (faults, net.ends()[-1]) == (number, 'served')
+    texts = ''.join(text for name in ('user1', 'channel') for text in net.logged_texts(name))
+    assert "raise RuntimeError('short circuit')" in texts
