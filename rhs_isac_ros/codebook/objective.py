@@ -20,6 +20,7 @@ from rhs_isac_ros.model.arrays import checked_positions
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.geometry import surface_sides_m
 from rhs_isac_ros.support import streams
+from rhs_isac_ros.support.fields import whole
 
 # Relative error of the rows (see `bounds.rows`) of an objective. The error of the objective is
 # then below 0.1 %, far less than the sampling error. The gradient is exact for the value returned.
@@ -98,6 +99,7 @@ def sobol(scenario: Scenario, n: int, rng: np.random.Generator) -> np.ndarray:
     They are scrambled with a child of the seed of the generator, not with its next numbers: a
     second call gives other points, but numbers drawn in between make no difference.
     """
+    n = whole('n', n)
     points = streams.sobol(3, max(n - 1, 0).bit_length(), rng)[:n]
     low, high = scenario.roi_bounds_m
     return low + (high - low) * points

@@ -26,6 +26,7 @@ from rhs_isac_ros.positioning.diagnosis import FitTest
 from rhs_isac_ros.positioning.estimate import Estimate, estimate_each
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.errors import translated
+from rhs_isac_ros.support.fields import whole
 from rhs_isac_ros.support.files import ArchiveError, read_archive, read_once, write_archive
 from rhs_isac_ros.support.optional import optional_import
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -200,10 +201,8 @@ def train(
     the codebook does not fit the scenario, ValueError if a number is too small, or the inputs or
     the gain are unknown, and MissingLibraryError if scikit-learn is not installed.
     """
-    for name, value, minimum in (('n_pairs', n_pairs, 20), ('n_hidden', n_hidden, 1),
-                                 ('max_epochs', max_epochs, 1)):
-        if value < minimum:
-            raise ValueError(f'{name}: {value}, expected at least {minimum}')
+    n_pairs, n_hidden = whole('n_pairs', n_pairs, 20), whole('n_hidden', n_hidden, 1)
+    max_epochs, seed = whole('max_epochs', max_epochs, 1), whole('seed', seed)
     if inputs not in INPUTS:
         raise ValueError(f'inputs: {inputs!r}, expected one of {sorted(INPUTS)}')
     if scenario.user_gain_std_db == np.inf:

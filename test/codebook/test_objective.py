@@ -160,7 +160,7 @@ def test_samples_are_in_the_region_and_depend_on_the_generator(name, n):
 
 
 @pytest.mark.parametrize('seed', range(3))
-@pytest.mark.parametrize('n', [1, 2, 128])
+@pytest.mark.parametrize('n', [1, 2, np.int64(128)])
 def test_sobol_puts_one_point_in_each_slice(n, seed):
     low, high = LOPSIDED.roi_bounds_m
     unit = (objective.sobol(LOPSIDED, n, np.random.default_rng(seed)) - low) / (high - low)

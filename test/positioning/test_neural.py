@@ -99,7 +99,9 @@ def test_a_network_of_magnitudes_locates_signals_of_any_phase(scenario, codebook
 
 
 def test_networks_are_reproducible_by_their_seed(scenario, codebook):
-    first, same, other = (train(scenario, codebook, 600, seed, 8, 2) for seed in (4, 4, 5))
+    # Numbers of NumPy are numbers.
+    first, same, other = (train(scenario, codebook, n_pairs, seed, 8, 2) for n_pairs, seed in (
+        (600, 4), (np.int16(600), np.int64(4)), (600, 5)))
     np.testing.assert_array_equal(first.w_in, same.w_in)
     np.testing.assert_array_equal(first.w_out, same.w_out)
     assert not np.isclose(first.w_in, other.w_in).all()
