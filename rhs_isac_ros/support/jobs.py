@@ -112,6 +112,8 @@ def _definition(value: Any, seen: set[int]) -> Any:
         value = getattr(value, name) if isinstance(value, wrapper) else value
     if isinstance(value, functools.partial):
         value = (value.func, value.args, value.keywords)
+    if inspect.ismethod(value):
+        value = (value.__func__, value.__self__)
     if isinstance(value, np.ndarray):
         value = (value.dtype.str, value.shape, hashlib.sha256(value.tobytes()).hexdigest())
     if isinstance(value, Mapping):

@@ -33,7 +33,7 @@ class PluginError(ValueError):
 
 def _foreign(error: BaseException) -> list[traceback.FrameSummary]:
     """Return the frames of an error from the first one of other code than this and `importlib`."""
-    own = str(Path(__file__).parents[1]), str(Path(importlib.__file__).parent), '<frozen'
+    own = f'{Path(__file__).parents[1]}/', f'{Path(importlib.__file__).parent}/', '<frozen'
     return [*itertools.dropwhile(lambda frame: frame.filename.startswith(own),
                                  traceback.extract_tb(error.__traceback__))]
 

@@ -236,7 +236,8 @@ def test_values_bound_to_a_function_are_sources():
         if False:
             not_yet = 1
         return work
-    for wrap in (of, lambda value: functools.partial(print, end=value), Work, of_two):
+    for wrap in (of, lambda value: functools.partial(print, end=value), Work, of_two,
+                 lambda value: Work(value).__call__):
         one, other, same = (jobs_module.sources_of(wrap(value)) for value in (
             np.arange(2000), np.arange(1, 2001), np.arange(2000)))
         assert one == same != other
