@@ -4,8 +4,7 @@
 of `Estimator`, whose method ``estimate`` takes received signals and returns an `Estimate`. The
 classes of estimators are listed in `ESTIMATORS` below, and other packages may provide more as
 entry points of `plugins.ESTIMATORS`. A `Tracker` combines successive positioning phases of a
-moving user. A shot is the signals of one positioning
-phase in a batch of them.
+moving user. A shot is the signals of one positioning phase in a batch of them.
 
 Positions are ranges and direction cosines, (r, u, v), in which the modes of the likelihood are
 nearly Gaussian: the signals determine the range to a fraction of a wavelength, but the direction
@@ -19,14 +18,16 @@ The modules, in reading order:
 * `lattice`: lengths over which signals change, and the grid; `segments`: points of each shot
 * `likelihood`: the likelihood of positions and nuisance parameters; `nuisance`: the prior of the
   parameters; `dispersed`: errors of elements; `offsets`: carrier and timing from signals alone
-* `templates`, `peaks`, `grid`: starts of the search; `search`: ascent from the starts to the
-  modes; `failures`: modes if elements have failed
+* `templates`, `peaks`, `grid`: starts of the search; `moving`: those of users who move in a cycle;
+  `projection`: signals of many measurements; `scope`: where `search` ascends from the starts to
+  the modes; `failures`: modes if elements have failed
 * `posterior`: from modes to samples; `draws`: samples without modes; `alternatives`: users outside
   or blocked; `diagnosis`: tests of the fit between signals and model;
   `movement`: tests of how users move in a cycle
-* `prior`: the update of a mixture with signals, and errors that all phases share; `fusion`:
-  several surfaces; `agreement`: surfaces whose pose is wrong; `alignment`: the pose of a surface
-  from common users; `site`: the surfaces of a site in a file
+* `prior`: the update of a mixture with signals, and errors that all phases share; `products` of
+  sheets, and `fusion`: several surfaces; `beyond`: users outside of a site; `agreement`: surfaces
+  whose pose is wrong; `alignment`: the pose of a surface from common users; `site`: the surfaces
+  of a site in a file
 * `tracking`: moving users
 * `neural`: the paper's network; `store`: tables in files
 """

@@ -1,6 +1,7 @@
 """Whether signals fit the model: those of one phase, and of the latest cycles."""
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
@@ -137,20 +138,17 @@ def energies(n, scale=1.0, seed=0):
     return scale * gamma(EXPECTED).rvs(n, random_state=np.random.default_rng(seed))
 
 
-def filled(values, *arguments, expected=EXPECTED):
+def filled(values, *arguments, expected=EXPECTED, may_warn=True):
+    """Return a test after residuals."""
     test = diagnosis.InnovationTest(*arguments)
     for value in values:
         test.add(float(value), expected)
+        assert may_warn or not test.drifts
     return test
 
 
-def without_warning(values, *arguments, expected=EXPECTED):
-    """Return a test after residuals, none of which causes a warning."""
-    test = diagnosis.InnovationTest(*arguments)
-    for value in values:
-        test.add(float(value), expected)
-        assert not test.drifts
-    return test
+#: Returns a test after residuals, none of which causes a warning.
+without_warning = functools.partial(filled, may_warn=False)
 
 
 @pytest.mark.slow
