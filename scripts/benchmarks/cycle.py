@@ -39,11 +39,10 @@ from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE, OBSERVATION, arrived_s, subscribe
 from rhs_isac_ros.ros.environment import check_environment, private_domain, use_discovery_profile
 from rhs_isac_ros.ros.run import run
-from rhs_isac_ros.support.arguments import positive_int
 from rhs_isac_ros.tools.demo import start_network
 
 LAYOUTS = {'processes': 'one process per node', 'composed': 'all nodes in one process'}
-USERS, ROUND_TRIPS = 2, 2000
+USERS, CYCLES, ROUND_TRIPS = 2, 300, 2000
 # Pause between cycles, so that the report of one does not compete with the next for the cores.
 REST_S = 0.05
 # Links of the chain that consist of computations.
@@ -66,15 +65,14 @@ SENDERS = {
 def main() -> None:
     """Run the benchmark."""
     parser = frame.benchmark_parser('cycle', __doc__, default_seed=None)
-    parser.add_argument('--cycles', type=positive_int, default=300, help='number of cycles')
     options = parser.parse_args()
     check_environment(parser)
     os.environ.update(private_domain())
     use_discovery_profile()
     results = {}
     for layout, where in LAYOUTS.items():
-        print(f'{where}, {USERS} users, {options.cycles} cycles\n', flush=True)
-        cycles, hops_s, cpu_s = measure(options.cycles, layout == 'composed')
+        print(f'{where}, {USERS} users, {CYCLES} cycles\n', flush=True)
+        cycles, hops_s, cpu_s = measure(CYCLES, layout == 'composed')
         table = frame.Table(['time'], {
             'median': ('median', 2), '10th percentile': ('p10', 2), '99th percentile': ('p99', 2)})
         results[layout] = {

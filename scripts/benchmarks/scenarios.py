@@ -33,9 +33,7 @@ MISSED = 2.0
 
 def main() -> None:
     """Run the benchmark."""
-    parser = frame.benchmark_parser('scenarios', __doc__, 1000)
-    parser.add_argument('--only', nargs='*', metavar='NAME', help='only these scenarios')
-    options = parser.parse_args()
+    options = frame.benchmark_parser('scenarios', __doc__, 1000).parse_args()
     table = frame.Table(['scenario'], {
         'fix [%]': ('fix', 1), 'in the 95 % region [%]': ('covered', 1), 'NEES': ('nees', 2),
         'missed [%]': ('missed', 2), 'error [m]': ('rms_m', 3), 'claimed [m]': ('claimed_m', 3),
@@ -43,12 +41,11 @@ def main() -> None:
         'memory [MB]': ('peak_mib', 0)})
     results = {}
     for name in ['table1', *sorted(path.stem for path in FOLDER.glob('*.yaml'))]:
-        if not options.only or name in options.only:
-            # The memory of the optimisation is not that of the estimator.
-            codebook = frame.in_new_process(design, name)
-            results[name] = table.row(name, **frame.in_new_process(
-                measure, name, codebook, options.positions, options.seed))
-            frame.write_results(options.json, results)
+        # The memory of the optimisation is not that of the estimator.
+        codebook = frame.in_new_process(design, name)
+        results[name] = table.row(name, **frame.in_new_process(
+            measure, name, codebook, options.positions, options.seed))
+        frame.write_results(options.json, results)
 
 
 def design(name: str) -> Codebook:

@@ -27,20 +27,18 @@ from rhs_isac_ros.tools.demo import start_network
 TIMEOUT_S = 600.0
 # Minimum number of measured cycles.
 MIN_CYCLES = 200
-# Users of the network to compare with, and users as processes of their own: in the discovery range
-# LOCALHOST, 32 processes of one machine discover each other.
-FEW, SEPARATE = 2, 25
+# Users of the network to compare with, users as processes of their own, and users that share one
+# process. In the discovery range LOCALHOST, 32 processes of one machine discover each other.
+FEW, SEPARATE, TOGETHER = 2, 25, 1000
 
 
 def main() -> None:
     """Run the benchmark."""
     parser = frame.benchmark_parser('users', __doc__, default_seed=None)
-    parser.add_argument('--users', type=positive_int, default=1000,
-                        help='number of users that share one process')
     parser.add_argument('--rounds', type=positive_int, default=2, help='cycles for each user')
     options = parser.parse_args()
     check_environment(parser)
-    networks = {'separate': (SEPARATE, False), 'together': (options.users, True)}
+    networks = {'separate': (SEPARATE, False), 'together': (TOGETHER, True)}
     os.environ.update(private_domain())
     use_discovery_profile()
     rclpy.init(args=[])
