@@ -161,15 +161,15 @@ def _lattice(scenario: Scenario) -> np.ndarray:
     for band in range(scenario.n_bands):
         total = np.zeros((1, 1, 1))
         for waves in _plane_waves(scenario, band, is_even, _ANGLE_NODES):
-            along_y = np.einsum('a,eay->ey', waves.azimuth_weights,
-                                waves.along_y * np.square(waves.gain)[..., None])
+            shares = waves.azimuth_weights * np.square(waves.gain)
+            along_y = np.einsum('yea,ea->ey', waves.along_y, np.broadcast_to(
+                shares, waves.along_y.shape[1:]))
             # Offsets of both signs along z, but only non-negative ones along y.
             along_z = [waves.along_z]
             if not is_even[1]:
                 along_z.append(np.conj(waves.along_z))
             total = total + np.stack([
-                np.einsum('e,ey,ez->zy', waves.elevation_weights, along_y, one)
-                for one in along_z])
+                (one * waves.elevation_weights) @ along_y for one in along_z])
         half = np.concatenate([total[-1][:0:-1], total[0]])
         half = half * _mean_power(scenario, band)
         lattice[band] = np.concatenate([np.conj(half[::-1, :0:-1]), half], axis=1)
@@ -215,7 +215,7 @@ class _PlaneWaves(NamedTuple):
     elevation_weights: np.ndarray
     azimuth_weights: np.ndarray
     gain: float | np.ndarray
-    # Phasors at the rows [E, rows] and at the columns [E, A, columns]; only their real parts along
+    # Phasors at the rows [rows, E] and at the columns [columns, E, A]; only their real parts along
     # an axis that `is_even` marks.
     along_z: np.ndarray
     along_y: np.ndarray
@@ -226,18 +226,18 @@ def _plane_waves(
 ) -> Iterator[_PlaneWaves]:
     """Yield plane waves in blocks of elevations, sized for `n_draws` amplitudes per wave."""
     wavenumber = 2 * np.pi * scenario.center_frequencies_hz[band] / SPEED_OF_LIGHT_MPS
-    columns, rows = (np.arange(n) * interval_m for n, interval_m in zip(
-        (scenario.n_columns, scenario.n_rows), geometry.element_intervals_m(scenario),
-        strict=True))
+    counts = scenario.n_columns, scenario.n_rows
+    by_column, by_row = (
+        wavenumber * interval_m for interval_m in geometry.element_intervals_m(scenario))
+    phases = by_column * (counts[0] - 1), by_row * (counts[1] - 1)
     # The elevation affects the phases along both axes.
-    lengths = columns[-1], math.hypot(columns[-1], rows[-1])
+    ranges = phases[0], math.hypot(*phases)
     (azimuth, azimuth_weights), (elevations, elevation_weights) = (
         _profile_quadrature(
-            _fields(scenario).angular_spread_deg, mean, even, wavenumber * length, n_nodes)
-        for mean, even, length in zip(
-            scenario.multipath_direction_deg, is_even, lengths, strict=True))
-    phasors = [np.cos if even else lambda phase: np.exp(1j * phase) for even in is_even]
-    size = max(_BLOCK_NUMBERS // (len(azimuth) * max(len(columns), n_draws)), 1)
+            _fields(scenario).angular_spread_deg, mean, even, phase, n_nodes)
+        for mean, even, phase in zip(
+            scenario.multipath_direction_deg, is_even, ranges, strict=True))
+    size = max(_BLOCK_NUMBERS // (len(azimuth) * max(counts[0], n_draws)), 1)
     for block in blocks(len(elevations), size):
         elevation = elevations[block]
         # Direction (cos el cos az, cos el sin az, sin el).
@@ -248,8 +248,20 @@ def _plane_waves(
             scenario.element_gain, GainPattern) else cosine[:1, :1])
         yield _PlaneWaves(
             elevation_weights[block], azimuth_weights, gain,
-            phasors[1](wavenumber * np.sin(elevation)[:, None] * rows),
-            phasors[0](wavenumber * across[..., None] * columns))
+            _phasors(by_row * np.sin(elevation), counts[1], is_even[1]),
+            _phasors(by_column * across, counts[0], is_even[0]))
+
+
+def _phasors(phase: np.ndarray, n: int, is_even: bool) -> np.ndarray:
+    """Return exp(i k phase) for k < n, [n, ...]; only the real part of an even profile."""
+    powers = np.ones((n, *phase.shape), complex)
+    # Products of known powers, which are several times as fast as exponentials.
+    step, known = np.exp(1j * phase), 1
+    while known < n:
+        more = min(known, n - known)
+        np.multiply(powers[:more], step, out=powers[known:known + more])
+        step, known = step * step, 2 * known
+    return np.ascontiguousarray(powers.real) if is_even else powers
 
 
 def _mean_power(scenario: Scenario, band: int) -> float:
@@ -385,7 +397,8 @@ def _draw_plane_waves(
         amplitudes *= (waves.gain * np.sqrt(
             waves.elevation_weights[:, None] * waves.azimuth_weights))[:, None]
         drawn = drawn + np.einsum(
-            'ez,eny->nzy', waves.along_z, np.matmul(amplitudes, waves.along_y), optimize=True)
+            'ze,eny->nzy', waves.along_z,
+            np.matmul(amplitudes, np.moveaxis(waves.along_y, 0, 2)), optimize=True)
     return np.sqrt(_mean_power(scenario, band)) * drawn
 
 

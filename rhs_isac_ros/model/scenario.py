@@ -257,6 +257,7 @@ _FILES = [name for name, kind in _EXTERNAL.items() if issubclass(kind, ArrayFile
 _OF_EVERY_ID = {
     'amplitude_levels', 'multipath_to_los_db', 'user_gain_std_db', 'phase_std_rad', 'timing_std_s',
     'band_phase_std_rad', 'carrier_offset_std_hz', 'element_error_rms', 'failed_element_share'}
+_OPTIONAL = {field.name for field in dataclasses.fields(Extensions)} - _OF_EVERY_ID
 
 
 @dataclasses.dataclass(frozen=True)
@@ -391,16 +392,15 @@ class Scenario(Extensions, Table1):
     @functools.cached_property
     def id(self) -> str:
         """Hash of the fields: ``sc`` and 16 hex digits, which YAML never parses as a number."""
-        changes, fields = self.changes(), self.fields()
-        # A field that is introduced later must leave the identifiers in existing files valid.
-        for name in {field.name for field in dataclasses.fields(Extensions)} - _OF_EVERY_ID:
-            if name not in changes:
-                del fields[name]
-            elif name in _FILES:
-                # The same file has the same identifier on every host.
-                fields[name] = fields[name].rpartition('@')[2]
-            elif name == 'board':
-                fields[name] = self.board.id
+        fields: dict[str, Any] = {}
+        for field in dataclasses.fields(self):
+            name, value = field.name, getattr(self, field.name)
+            # A field that is introduced later must leave the identifiers in existing files valid.
+            if name in _OPTIONAL and value == field.default:
+                continue
+            plain = value.id if name == 'board' else as_plain(value)
+            # The same file has the same identifier on every host.
+            fields[name] = plain.rpartition('@')[2] if name in _FILES else plain
         return f'sc{hashlib.sha256(json.dumps(fields).encode()).hexdigest()[:16]}'
 
     @property
@@ -498,7 +498,8 @@ def as_plain(value: Any) -> Any:
     if isinstance(value, float) and value == np.inf:
         return UNKNOWN
     if isinstance(value, Pose):
-        return {name: as_plain(entry) for name, entry in dataclasses.asdict(value).items()}
+        return {field.name: as_plain(getattr(value, field.name))
+                for field in dataclasses.fields(value)}
     return [as_plain(entry) for entry in value] if isinstance(value, tuple) else value
 
 
