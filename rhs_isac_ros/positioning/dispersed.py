@@ -23,8 +23,8 @@ from rhs_isac_ros.positioning.nuisance import NuisancePrior
 # Numbers of failures to average over: smallest probability of each, and how many at most.
 _MIN_PROBABILITY = 1e-5
 _MAX_COUNTS = 12
-# Memory of the covariances of several points [bytes].
-_MAX_BYTES = 1 << 27
+# Memory of the covariances of several points [bytes]; less of it stays in the cache.
+_MAX_BYTES = 1 << 23
 # Share of the whitened energy up to which errors of an estimated surface need no covariance for
 # each position.
 _MIN_ERROR_SHARE = 0.05

@@ -59,7 +59,14 @@ from rhs_isac_ros.positioning.prior import (
     uniform,
 )
 from rhs_isac_ros.positioning.scope import SearchScope
-from rhs_isac_ros.positioning.search import GRID_MARGIN, Modes, OneState, likely_modes, modes_from
+from rhs_isac_ros.positioning.search import (
+    EXACT_MARGIN,
+    GRID_MARGIN,
+    Modes,
+    OneState,
+    likely_modes,
+    modes_from,
+)
 from rhs_isac_ros.positioning.segments import Segments, concatenate, select
 from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.positioning.store import load_table
@@ -85,6 +92,9 @@ class _Limits(NamedTuple):
     doubt: float = 0.05
     # Log odds of an alternative below which averages over surfaces leave no doubt.
     clear: float = -3.0
+    # Number of modes of the average over surfaces, which only shows whether there is a doubt. The
+    # others contain 1 % of its evidence.
+    averaged: int = 32
     # Growth of errors on the grid, see `NuisancePrior.growth`, above which it is searched again.
     noisier: float = 8.0
 
@@ -142,7 +152,8 @@ class SearchEstimator(abc.ABC):
         self._bounds = likelihood.resolution.bounds_m
         self._prior_m2 = float(np.sum((self._bounds[1] - self._bounds[0])**2)) / 12
         self._phases = BandPhases(likelihood)
-        self._refinement, self._averaging = refinement_of(likelihood), OneState(likelihood)
+        self._refinement = refinement_of(likelihood)
+        self._averaging = OneState(likelihood, EXACT_MARGIN)
         # What distinguishes users without a direct path, and their parameters.
         self._blocked = [Blocked(
             scenario, n_measurements,
@@ -404,10 +415,10 @@ class SearchEstimator(abc.ABC):
         likelihood, coarse = self._likelihood, modes
         modes, conditionals = self._refinement.refine(coarse, signals, scope.table)
         samples = averaged = self._samples(modes, conditionals, signals)
-        if not isinstance(self._refinement, OneState):
+        if scope.alternatives and not isinstance(self._refinement, OneState):
             # The margin of the refinement admits modes that count only for some states.
-            averaged = self._samples(*self._averaging.refine(
-                likely_modes(coarse), signals, scope.table), signals)
+            averaged = self._samples(*self._averaging.refine(likely_modes(
+                coarse, _LIMITS.averaged), signals, scope.table), signals)
         means, covariances = self._moments(modes, samples)
         # If the model holds, twice the residual energy, averaged over the posterior, has the mean
         # of a chi-square variable. At the best of several modes, it is smaller than the average.

@@ -135,12 +135,15 @@ class Refinement(Protocol):
 
 
 class OneState:
-    """Refinement for elements that are known, or whose errors are averaged: a `Refinement`."""
+    """Refinement for elements that are known, or whose errors are averaged: a `Refinement`.
+
+    With a `margin`, that of `ascend`, modes without weight are left out.
+    """
 
     margin = 0.0
 
-    def __init__(self, likelihood: Likelihood) -> None:
-        self._likelihood = likelihood
+    def __init__(self, likelihood: Likelihood, margin: float = np.inf) -> None:
+        self._likelihood, self._margin = likelihood, margin
         self._dispersed = DispersedLikelihood.of(likelihood)
         self._conditional: Conditional = self._dispersed or likelihood
         self.is_exact = self._conditional is likelihood
@@ -154,7 +157,7 @@ class OneState:
         """Take one step in the likelihood with the errors; see `Refinement.refine`."""
         if not self.is_exact:
             modes = ascend(
-                self._conditional, self._likelihood, modes.starts(), signals, 1, np.inf)
+                self._conditional, self._likelihood, modes.starts(), signals, 1, self._margin)
         return modes, dict.fromkeys(np.unique(modes.shots).tolist(), [self._conditional])
 
     def same(self, other: Conditional) -> Conditional:
@@ -188,10 +191,11 @@ def modes_from(starts: Starts, likelihood: Likelihood, signals: Signals, aligned
                   EXACT_MARGIN + extra_margin)
 
 
-def likely_modes(modes: Modes) -> Modes:
-    """Return the modes of each shot, the most likely first, without those of no weight."""
-    return select(modes, heaviest(
-        Segments.of_keys(modes.shots), modes.log_likelihood, EXACT_MARGIN))
+def likely_modes(modes: Modes, n: int) -> Modes:
+    """Return the first n modes of each shot, the most likely first, without those of no weight."""
+    of_shot = Segments.of_keys(modes.shots)
+    return select(modes, (of_shot.places < n) & heaviest(
+        of_shot, modes.log_likelihood, EXACT_MARGIN))
 
 
 def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,
