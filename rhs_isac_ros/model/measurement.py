@@ -478,31 +478,48 @@ class ElementSums:
         varies = bool(by_coordinate.any())
         n_terms = 2 + self._n_sums if varies else 1
         rows = np.zeros((n_bands, n, 1 + n_slopes, n_subbands, n_frames), complex)
-        moments = self._moments.reshape(n_bands, n_subbands, n_elements, -1, n_frames)
-        # Users at rest are at one place in all frames.
-        n_same = 1 if states[:, 3:].any() else n_frames
-        terms = np.empty((n, n_terms, n_subbands, n_same), complex)
-        for band, first in np.ndindex(n_bands, n_frames // n_same):
-            same = slice(first, first + n_same)
-            times_s = geometry.frame_times_s(self._scenario)[band, same]
-            places = states[:, :3] + times_s[0] * states[:, 3:]
-            waves = los_waves(self._scenario, places, [band], slopes=varies)
-            self._add_up(waves, self._frames[[band], ..., same], moments[
-                [band], ..., same].reshape(1, n_subbands, n_elements, -1), terms[None])
-            rows[band, :, 0, :, same] = terms[:, 0]
-            if varies:
-                weights = self.weights(places)
-                for frame, time_s in enumerate(times_s):
-                    by_place = by_coordinate[:, :3] + time_s * by_coordinate[:, 3:]
-                    by_term = np.matmul(np.swapaxes(by_place, 1, 2), weights)
-                    of_frame = np.ascontiguousarray(terms[:, 1:, :, frame]).view(float)
-                    rows[band, :, 1:, :, first + frame] = np.matmul(
-                        by_term, of_frame).view(complex)
+        # Users at rest are at one place in all frames. Otherwise, each frame has its own place. In
+        # the sums, places take the part of the bands.
+        moves = bool(states[:, 3:].any())
+        frames, moments = self._of_frames if moves else (
+            self._frames[:, None], self._moments[:, None])
+        for band, times_s in enumerate(geometry.frame_times_s(self._scenario)):
+            for part in blocks(frames.shape[1], max(self.block // n, 1)):
+                of_place, same = frames[band, part], part if moves else slice(None)
+                times = times_s[same, None, None]
+                places = states[:, :3] + times[:len(of_place)] * states[:, 3:]
+                waves = los_waves(
+                    self._scenario, places.reshape(-1, 3), [band], slopes=varies)
+                shape = n_subbands, len(places), n, n_elements
+                gain, radial, *others = (one.reshape(shape).swapaxes(0, 1) for one in (
+                    *waves[:2], *waves[2]))
+                terms = np.empty((len(places), n, n_terms, n_subbands, frames.shape[-1]), complex)
+                self._add_up(
+                    (gain, radial, others), of_place, moments[band, part], terms)
+                rows[band, :, 0, :, same] = np.moveaxis(terms[:, :, 0], 0, 2).reshape(
+                    n, n_subbands, -1)
+                if varies:
+                    by_place = by_coordinate[:, :3] + times[..., None] * by_coordinate[:, 3:]
+                    weights = self.weights(places.reshape(-1, 3)).reshape(
+                        len(places), n, 3, -1)
+                    by_term = np.matmul(np.swapaxes(by_place, 2, 3), weights)
+                    of_frame = np.ascontiguousarray(np.moveaxis(terms[:, :, 1:], 4, 1).reshape(
+                        len(times), n, n_terms - 1, n_subbands)).view(float)
+                    rows[band, :, 1:, :, same] = np.moveaxis(
+                        np.matmul(by_term, of_frame).view(complex), 0, 3)
         return rows.reshape(n_bands, n, 1 + n_slopes, -1)
+
+    @functools.cached_property
+    def _of_frames(self) -> tuple[np.ndarray, np.ndarray]:
+        """Those of `_frames` and `_moments` of each frame, [N_B, F, N_SB, N_E, 1 or 1 + A]."""
+        n_frames = self._frames.shape[3]
+        moments = self._moments.reshape(*self._frames.shape[:3], -1, n_frames)
+        return (np.ascontiguousarray(np.moveaxis(self._frames[..., None], 3, 1)),
+                np.ascontiguousarray(np.moveaxis(moments, 4, 1)))
 
     def _add_up(self, waves: Waves, frames: np.ndarray, moments: np.ndarray, terms: np.ndarray
                 ) -> None:
-        """Write the sums for some frames of B bands to `terms`, [B, N, 1 + G, N_SB, F]."""
+        """Write sums for frames of B bands or places to `terms`, [B, N, 1 + G, N_SB, F]."""
         gain, radial, boresight_terms = waves
         rows = terms.transpose(0, 3, 1, 2, 4)
         rows[..., 0, :] = np.matmul(gain, frames)
