@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import read_only
+from rhs_isac_ros.model.arrays import is_masked, read_only
 from rhs_isac_ros.model.board import Board
 from rhs_isac_ros.model.boards import board_of
 from rhs_isac_ros.model.elementwise import Paper
@@ -586,7 +586,7 @@ def _strengths(field: dataclasses.Field[Any], value: Any) -> tuple[tuple[str, fl
 
 def _entries(field: dataclasses.Field[Any], value: Any, expected: str) -> Any:
     """Return the value if it is a list with at least one entry, or raise ScenarioError."""
-    if isinstance(value, np.ma.MaskedArray):
+    if is_masked(value):
         raise ScenarioError(f'{field.name}: a masked array, expected a list of {expected}')
     if (not isinstance(value, list | tuple | np.ndarray) or getattr(value, 'shape', None) == ()
             or len(value) == 0):

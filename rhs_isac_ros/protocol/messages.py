@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rhs_isac_ros.model import Pose, Scenario
-from rhs_isac_ros.model.arrays import all_finite, position_problem
+from rhs_isac_ros.model.arrays import all_finite, is_masked, position_problem
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.gaussian import covariance_problem
 from rhs_isac_ros.support.fields import Field
@@ -121,7 +121,7 @@ def _array_problem(
         described = ', '.join(d if d.isdigit() else f'{d} = {e}'
                               for d, e in zip(dims, expected, strict=True))
         return f'shape {list(value.shape)}, expected [{described}]'
-    if isinstance(value, np.ma.MaskedArray) or (
+    if is_masked(value) or (
             value.dtype.kind == 'c' and declared.kind is not complex):
         return f'{type(value).__name__} of {value.dtype}, expected real numbers without a mask'
     has_range = value.size and (declared.low > -math.inf or declared.high < math.inf)
