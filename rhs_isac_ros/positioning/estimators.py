@@ -353,7 +353,8 @@ class SearchEstimator(abc.ABC):
         energies = np.sum(np.abs(self._likelihood.model.combine(
             signals.received))**2, axis=(1, 2)) / self.scenario.noise_power_w
         reasons = list(map(self._test.min_energy_test, energies.tolist()))
-        found = [_Found(self, Estimate.without_fix(reason)) for reason in reasons]
+        found = {row: _Found(self, Estimate.without_fix(reason))
+                 for row, reason in enumerate(reasons) if reason}
         usable = [row for row, reason in enumerate(reasons) if not reason]
         if usable:
             signals = select(signals, usable)
@@ -371,7 +372,7 @@ class SearchEstimator(abc.ABC):
                 estimate = self._judge(
                     scope.alternatives, log_ratios, searched, select(signals, [n]), one, values)
                 found[row] = _Found(self, estimate, log_ratios, *searched, outside[n])
-        return found
+        return [found[row] for row in range(len(reasons))]
 
     def _fits(self, scope: SearchScope, signals: Signals, aligned: np.ndarray,
               whitened: np.ndarray, draws: bool) -> list['_Searched']:
@@ -393,7 +394,10 @@ class SearchEstimator(abc.ABC):
     def _in_noise(self, scope: SearchScope, modes: Modes, signals: Signals, aligned: np.ndarray,
                   whitened: np.ndarray, margin: np.ndarray) -> Modes:
         """Search again, with a wider margin, for the modes of shots with a low gain."""
-        prior, best = self._likelihood.nuisance, Segments.of_keys(modes.shots)
+        prior = self._likelihood.nuisance
+        if not prior.has_gain:
+            return modes
+        best = Segments.of_keys(modes.shots)
         growth = prior.growth(best.first(modes.values) @ prior.gain)
         parts = [modes]
         # The margin of users who move does not depend on the scope.
