@@ -89,8 +89,8 @@ class OutsideGrid(NamedTuple):
     # Number of places to which sets of failed elements are fitted.
     places: int = 24
     # Sheets around places: numbers before and after a merger, and squared distance within one.
-    cells: int = 128
-    sheets: int = 16
+    cells: int = 256
+    sheets: int = 32
     apart: float = 3.0
 
 

@@ -28,7 +28,7 @@ class _Limits(NamedTuple):
     """Numbers that trade the speed of products for their accuracy."""
 
     # Largest number of products, and decrease of the logarithm of their masses.
-    products: int = 128
+    products: int = 256
     margin: float = 15.0
     samples: int = 16
     # Numbers of ranges and directions of the points that represent a surface's prior.
