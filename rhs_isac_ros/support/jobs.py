@@ -35,7 +35,7 @@ from rhs_isac_ros.support import plugins
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 from rhs_isac_ros.support.progress import progress_bar
-from rhs_isac_ros.support.threads import one_blas_thread
+from rhs_isac_ros.support.threads import keep_memory, one_blas_thread
 
 
 class JobError(Exception):
@@ -399,8 +399,7 @@ class _Entry:
     record: Mapping[str, Any]  # What the result depends on.
     # Objects of this process to which names in the arguments refer.
     given: Mapping[tuple[str, str], Any]
-    # Digests of the modules of the function and of plug-ins, by name, if other processes import
-    # them.
+    # Digests of modules of the function and plug-ins that other processes import, by name.
     modules: Mapping[str, str]
     result: dict[str, Any] | None = None
     waiting: list[int] = dataclasses.field(default_factory=list)
@@ -537,6 +536,7 @@ def _attempt_on_cluster(
                     return
 
     threading.Thread(target=watch, daemon=True).start()
+    keep_memory()
     try:
         return attempt(function, job, given, modules)
     finally:

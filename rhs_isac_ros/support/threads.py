@@ -1,4 +1,4 @@
-"""Threads of the numerical functions of the package.
+"""Threads of the numerical functions of the package, and the memory of their arrays.
 
 Most matrix products here are so small that the threads of BLAS spend more time waiting for each
 other than computing. If another process occupies a core, a call with several threads takes up to
@@ -7,6 +7,8 @@ fifty times as long as with one. Public functions therefore run BLAS with one th
 """
 
 import contextlib
+import ctypes
+import functools
 import itertools
 import os
 import threading
@@ -22,6 +24,24 @@ _Item = TypeVar('_Item')
 _Result = TypeVar('_Result')
 # A BLAS library in threadpoolctl, which has no type annotations.
 _Library: TypeAlias = Any
+# Parameters of mallopt in glibc, and the largest values that glibc itself would choose [bytes].
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+_TRIM_BYTES, _MMAP_BYTES = 1 << 26, 1 << 25
+
+
+@functools.cache
+def keep_memory() -> None:
+    """Let this process keep the memory of arrays that are freed, as without a setting of glibc.
+
+    The workers of Dask have the setting MALLOC_TRIM_THRESHOLD_, with which every temporary array
+    above 128 kB comes from the system anew: most of the time goes into clearing its pages.
+    """
+    if 'MALLOC_TRIM_THRESHOLD_' in os.environ:
+        # Other C libraries do not have the function.
+        with contextlib.suppress(AttributeError):
+            mallopt = ctypes.CDLL(None).mallopt
+            mallopt(_M_MMAP_THRESHOLD, _MMAP_BYTES)
+            mallopt(_M_TRIM_THRESHOLD, _TRIM_BYTES)
 
 
 class _OneBlasThread(contextlib.ContextDecorator):

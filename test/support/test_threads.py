@@ -1,6 +1,12 @@
-"""Public functions run BLAS with one thread and leave the setting of the process as it was."""
+"""Public functions run BLAS with one thread and leave the setting of the process as it was.
+
+Workers of Dask keep the memory of temporary arrays.
+"""
 
 import os
+import platform
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -188,3 +194,37 @@ def test_an_error_in_a_block_propagates():
     with pytest.raises(ZeroDivisionError):
         map_blocks(lambda number: 1 / number, [1, 0])
     assert set(numbers()) == {3}
+
+
+CODE = '''
+import resource
+import sys
+
+import numpy as np
+
+from rhs_isac_ros.support.threads import keep_memory
+
+
+def faults():
+    """Return the number of page faults of computations with arrays of 1 MB."""
+    x, before = np.ones(1 << 17), resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        x = np.sqrt(x * x + 1)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+
+print(faults())
+keep_memory()
+faults()
+print(faults())
+'''
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != 'glibc', reason='a setting of glibc')
+def test_a_worker_keeps_the_memory_of_arrays_that_are_freed():
+    # As the nanny of a worker sets it.
+    before, after = map(int, subprocess.check_output(
+        [sys.executable, '-c', CODE], env=os.environ | {'MALLOC_TRIM_THRESHOLD_': '65536'},
+        text=True, timeout=60).split())
+    assert before > 10_000
+    assert after < 100
