@@ -253,7 +253,7 @@ _EXTERNAL: dict[str, type[External]] = {
     'element_gain': GainPattern, 'user_gain': GainPattern, 'multipath': MultipathEstimate,
     'channel': PathChannel}
 _FILES = [name for name, kind in _EXTERNAL.items() if issubclass(kind, ArrayFile)]
-# Fields of `Extensions` that the identifier contains although they have their default values.
+# Identifiers in existing files stay valid: of `Extensions`, these alone count with defaults, too.
 _OF_EVERY_ID = {
     'amplitude_levels', 'multipath_to_los_db', 'user_gain_std_db', 'phase_std_rad', 'timing_std_s',
     'band_phase_std_rad', 'carrier_offset_std_hz', 'element_error_rms', 'failed_element_share'}
@@ -395,7 +395,6 @@ class Scenario(Extensions, Table1):
         fields: dict[str, Any] = {}
         for field in dataclasses.fields(self):
             name, value = field.name, getattr(self, field.name)
-            # A field that is introduced later must leave the identifiers in existing files valid.
             if name in _OPTIONAL and value == field.default:
                 continue
             plain = value.id if name == 'board' else as_plain(value)

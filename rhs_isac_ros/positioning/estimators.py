@@ -13,6 +13,7 @@ import numpy as np
 from rhs_isac_ros.model import MeasurementModel, Pose
 from rhs_isac_ros.model.arrays import blocks, mixture_weights
 from rhs_isac_ros.model.gaussian import share_of_level
+from rhs_isac_ros.positioning import prior as priors
 from rhs_isac_ros.positioning.alternatives import (
     Alternative,
     Blocked,
@@ -43,20 +44,6 @@ from rhs_isac_ros.positioning.posterior import (
     Samples,
     draw_broad_samples,
     draw_samples,
-)
-from rhs_isac_ros.positioning.prior import (
-    ELSEWHERE,
-    MIN_EXTENT_M,
-    PRIOR_MARGIN,
-    WRONG,
-    Users,
-    cells_of,
-    constant_covariance,
-    constant_shares,
-    inside,
-    is_doubtful,
-    multiply,
-    uniform,
 )
 from rhs_isac_ros.positioning.scope import SearchScope
 from rhs_isac_ros.positioning.search import (
@@ -199,7 +186,7 @@ class SearchEstimator(abc.ABC):
         region exists.
         """
         likelihood, grid = self._likelihood, lay_grid(self._likelihood.scenario)
-        chosen = cells_of(bent, grid, likelihood.resolution)
+        chosen = priors.cells_of(bent, grid, likelihood.resolution)
         # A cached property is in vars() once it is computed.
         if '_region' not in vars(self) and chosen.any():
             part = grid.within(chosen)
@@ -216,7 +203,7 @@ class SearchEstimator(abc.ABC):
 
     @one_blas_thread
     def posterior(self, received: np.ndarray, prior: Mixture | None = None, *,
-                  wrong: float = WRONG, share: float = 1.0, n_before: float = 0.0
+                  wrong: float = priors.WRONG, share: float = 1.0, n_before: float = 0.0
                   ) -> Estimate:
         """Estimate positions, and keep the posterior as a mixture; signals as in `estimate`.
 
@@ -241,8 +228,8 @@ class SearchEstimator(abc.ABC):
         """
         signals = self._likelihood.signals(checked_received(self._likelihood.codebook, received))
         if prior is None:
-            for name, value, default in (
-                    ('wrong', wrong, WRONG), ('share', share, 1.0), ('n_before', n_before, 0.0)):
+            for name, value, default in (('wrong', wrong, priors.WRONG), ('share', share, 1.0),
+                                         ('n_before', n_before, 0.0)):
                 if value != default:
                     raise ValueError(f'{name}: {value}, expected together with a prior')
             found = [one.posterior() for block in blocks(len(signals.received), _LIMITS.block)
@@ -264,8 +251,8 @@ class SearchEstimator(abc.ABC):
         """
         pose, extent = self.scenario.pose, np.ptp(self._bounds, axis=0)
         return Sheets.from_mixture(prior.or_within(
-            pose.to_site(self._bounds.mean(axis=0)),
-            pose.covariances_to_site(np.diag(np.maximum(extent, MIN_EXTENT_M)**2)), wrong), pose)
+            pose.to_site(self._bounds.mean(axis=0)), pose.covariances_to_site(
+                np.diag(np.maximum(extent, priors.MIN_EXTENT_M)**2)), wrong), pose)
 
     def _update(self, signals: Signals, prior: Mixture, wrong: float, share: float,
                 n_before: float) -> Estimate:
@@ -278,10 +265,10 @@ class SearchEstimator(abc.ABC):
             (found,) = self._locate_block(scope, signals, draws=False)
             if found.modes is None or found.estimate.reason:
                 continue
-            products = multiply(
+            products = priors.multiply(
                 before, found.modes, share, found.conditionals, self._likelihood, signals,
                 self._bounds, constant, n_before)
-            if not is_doubtful(products.energy / self._level, self._n_measurements):
+            if not priors.is_doubtful(products.energy / self._level, self._n_measurements):
                 break
         if found.modes is None or found.estimate.reason:
             return found.estimate
@@ -292,41 +279,41 @@ class SearchEstimator(abc.ABC):
             # Signals without a direct path contain no information. The odds are relative to a user
             # anywhere in the region.
             odds = share * np.log(blocked / max(1 - blocked - outside, 1e-12))
-            everywhere = uniform(found.modes.sheets(share), self._bounds).log_mass
+            everywhere = priors.uniform(found.modes.sheets(share), self._bounds).log_mass
             density = concatenate(density, before.weighted(everywhere + odds))
         return self.restricted(density.reduce(), dataclasses.replace(
             estimate, see=found.see(), is_elsewhere=products.is_last),
-            constant_covariance(products.best, constant, self.scenario.pose))
+            priors.constant_covariance(products.best, constant, self.scenario.pose))
 
     def _moving(self, signals: Signals, prior: Mixture, wrong: float, share: float) -> Estimate:
         """Compute the posterior of one shot of a user who moves."""
         estimate = self._locate_block(self._region, signals)[0].posterior()
         if (seen := estimate.sighting) is None or not estimate.fix:
             return estimate
-        density = Users.of(self.scenario, self._bounds, self.scenario.pose).updated(
+        joint = priors.Users.of(self.scenario, self._bounds, self.scenario.pose).updated(
             prior, seen.mixture.normalised(), seen.missing, share, wrong)
-        return self.restricted(self.in_front(density, ELSEWHERE), estimate, np.zeros((3, 3)))
+        return self.restricted(self.in_front(joint, priors.ELSEWHERE), estimate, np.zeros((3, 3)))
 
     def begin(self, estimate: Estimate) -> Mixture:
         """Return the posterior without a prior, from which a track begins."""
         assert estimate.sighting is not None and estimate.sighting.sheets is not None
         sheets = estimate.sighting.sheets
         best = select(sheets, [int(np.argmax(sheets.log_peaks))])
-        density = uniform(sheets.narrowed(self.constant_shares), self._bounds).normalised()
+        density = priors.uniform(sheets.narrowed(self.constant_shares), self._bounds).normalised()
         return density.to_mixture(self.scenario.pose).shared(
-            constant_covariance(best, self.constant_shares, self.scenario.pose))
+            priors.constant_covariance(best, self.constant_shares, self.scenario.pose))
 
     @functools.cached_property
     def constant_shares(self) -> np.ndarray:
         """Shares of variances that are the same in all phases; see the function of this name."""
-        return constant_shares(self._likelihood.model)
+        return priors.constant_shares(self._likelihood.model)
 
     def restricted(self, density: Sheets, estimate: Estimate, constant: np.ndarray) -> Estimate:
         """Return an estimate with the position and velocity of a density, in the region.
 
         `constant`, [3, 3] [m^2], is the covariance of further errors, which all phases share.
         """
-        density, mixture = inside(
+        density, mixture = priors.inside(
             density, self._bounds, self.normal[:_LIMITS.narrow], self.scenario.pose)
         pose = self.scenario.pose
         return dataclasses.replace(
@@ -379,7 +366,7 @@ class SearchEstimator(abc.ABC):
         """Find the posterior of each shot."""
         # Margin of modes in each cell, beyond the usual one.
         margin = (np.log(MISS_PROBABILITY / self.left_out) + self._refinement.margin
-                  + PRIOR_MARGIN * scope.favoured)
+                  + priors.PRIOR_MARGIN * scope.favoured)
         starts, drawn = scope.table.search(
             whitened, self._likelihood.nuisance, GRID_MARGIN + scope.alignment.margin + margin,
             scope.drawn.fit if scope.drawn and draws else None)
