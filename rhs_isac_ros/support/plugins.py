@@ -6,7 +6,6 @@ in place of a name also has such a name, under which this process finds it again
 
 import contextlib
 import functools
-import importlib
 import itertools
 import sys
 import traceback
@@ -14,7 +13,6 @@ import weakref
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from operator import attrgetter
-from pathlib import Path
 from typing import Any, TypeVar
 
 # Groups of entry points; the page `extending` of the documentation specifies their objects.
@@ -25,6 +23,9 @@ GAIN_PATTERNS = 'rhs_isac_ros.gain_patterns'
 BOARDS = 'rhs_isac_ros.boards'
 SURFACES = 'rhs_isac_ros.surfaces'
 RADIOS = 'rhs_isac_ros.radios'
+# Packages that call a plug-in or import it. Once `importlib_metadata` is imported, entry points of
+# `importlib.metadata` are its objects.
+_OWN = {__name__.partition('.')[0], 'importlib', 'importlib_metadata'}
 
 
 class PluginError(ValueError):
@@ -32,10 +33,11 @@ class PluginError(ValueError):
 
 
 def _foreign(error: BaseException) -> list[traceback.FrameSummary]:
-    """Return the frames of an error from the first one of other code than this and `importlib`."""
-    own = f'{Path(__file__).parents[1]}/', f'{Path(importlib.__file__).parent}/', '<frozen'
-    return [*itertools.dropwhile(lambda frame: frame.filename.startswith(own),
-                                 traceback.extract_tb(error.__traceback__))]
+    """Return the frames of an error from the first one of the code of a plug-in."""
+    names = (frame.f_globals.get('__name__', '') for frame, _ in traceback.walk_tb(
+        error.__traceback__))
+    own = itertools.takewhile(lambda name: name.partition('.')[0] in _OWN, names)
+    return traceback.extract_tb(error.__traceback__)[len([*own]):]
 
 
 def trace_of(error: BaseException | None) -> str:

@@ -1,6 +1,7 @@
 """Plug-ins of other packages."""
 
 import re
+import sys
 
 import pytest
 
@@ -68,6 +69,12 @@ def test_a_traceback_begins_in_the_code_of_the_plug_in(install, capsys):
     # No code of the plug-in has been called.
     assert exit_code_of(lambda: made('gone'), (PluginError,), 'walk') == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_code_that_imports_is_not_in_the_traceback(install, capsys, monkeypatch):
+    backport = pytest.importorskip('importlib_metadata')
+    monkeypatch.setattr(sys, 'meta_path', [backport.MetadataPathFinder(), *sys.meta_path])
+    test_a_traceback_begins_in_the_code_of_the_plug_in(install, capsys)
 
 
 def test_the_error_for_a_duplicate_name_names_both_packages(install):
