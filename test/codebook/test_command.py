@@ -156,7 +156,7 @@ def test_invalid_arguments_leave_the_last_output(call, files, capsys, arguments,
 def test_the_bands_are_chosen_with_the_codebook(call, files, scenario, capsys, monkeypatch):
     short = band_plan.EFFORT._replace(short_steps=2, short_positions=4, short_shots=4, shots=4)
     for name in ('choose_bands', 'best_of'):
-        monkeypatch.setattr(__main__, name, functools.partial(
+        monkeypatch.setattr(band_plan, name, functools.partial(
             getattr(band_plan, name), effort=short))
     plan, optimised = files / 'plan.yaml', band_plan.optimised
     arguments = ['--spectrum', '2.5e9:2.52e9', '3e9:3e9', '--bands', 2, '--raster', 5e6,

@@ -369,14 +369,14 @@ def test_optimised_levels_beat_rounding(continuous, levels):
 
 @pytest.mark.slow
 def test_the_penalty_moves_the_amplitudes_to_the_levels(monkeypatch):
-    rounds = []
+    rounds, run_lbfgs = [], methods.run_lbfgs
 
     def recording(objective, *arguments):
-        result = methods.run_lbfgs(objective, *arguments)
+        result = run_lbfgs(objective, *arguments)
         rounds.append((objective, result.x))
         return result
 
-    monkeypatch.setattr('rhs_isac_ros.codebook.methods.run_lbfgs', recording)
+    monkeypatch.setattr(methods, 'run_lbfgs', recording)
     optimize(with_levels(3), POSITIONS, max_steps=100)
     n_analog = random_codebook(SCENARIO, np.random.default_rng(0)).analog.size
 
