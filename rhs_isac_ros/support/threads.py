@@ -33,8 +33,8 @@ _TRIM_BYTES, _MMAP_BYTES = 1 << 26, 1 << 25
 def keep_memory() -> None:
     """Let this process keep the memory of arrays that are freed, as without a setting of glibc.
 
-    The workers of Dask have the setting MALLOC_TRIM_THRESHOLD_, with which every temporary array
-    above 128 kB comes from the system anew: most of the time goes into clearing its pages.
+    The workers of Dask have the setting ``MALLOC_TRIM_THRESHOLD_``, with which every temporary
+    array above 128 kB comes from the system anew: most of the time goes into clearing its pages.
     """
     if 'MALLOC_TRIM_THRESHOLD_' in os.environ:
         # Other C libraries do not have the function.
