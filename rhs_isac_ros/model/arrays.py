@@ -209,6 +209,16 @@ def checked_bounds(bounds_m: ArrayLike) -> np.ndarray:
     return array
 
 
+def log_size(bounds_m: np.ndarray, least_m: float = 0.0) -> float:
+    """Return the logarithm of the volume of a box with corners [2, 3] [m].
+
+    Without an extent along an axis, it is that of the area or the length. Extents below `least_m`
+    count as this one.
+    """
+    size = np.maximum(np.ptp(bounds_m, axis=0), least_m)
+    return float(np.log(size[size > 0]).sum())
+
+
 def checked_position(position: ArrayLike, name: str = 'position') -> np.ndarray:
     """Return a position in front of the surface as float64 [3] [m], or raise ValueError."""
     return _checked(name, position, (3,))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model import Pose
-from rhs_isac_ros.model.arrays import cross, mixture_weights
+from rhs_isac_ros.model.arrays import cross, log_size, mixture_weights
 from rhs_isac_ros.model.gaussian import likelihood_loss, moments, step_to_maximum, symmetric
 from rhs_isac_ros.positioning.estimate import Sighting
 from rhs_isac_ros.positioning.mixture import Mixture
@@ -223,7 +223,7 @@ class _Pairs(NamedTuple):
         log_weights, *others = map(np.concatenate, zip(*columns, strict=True))
         missing = np.array([one.missing + two.missing - one.missing * two.missing
                             for one, two in zip(reference, other, strict=True)])
-        log_outlier = np.log(missing) - np.log(np.ptp(bounds_m, axis=0)).sum()
+        log_outlier = np.log(missing) - log_size(bounds_m)
         counts = np.array([len(column[0]) for column in columns])
         return cls(Segments.of_counts(counts), np.ones(len(counts)), log_weights, log_outlier,
                    *others)

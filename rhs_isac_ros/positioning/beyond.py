@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rhs_isac_ros.model.arrays import log_size
 from rhs_isac_ros.model.geometry import to_polar
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.model.scenario import Scenario
@@ -57,7 +58,7 @@ def places_of(outside: Sheets, log_ratio: float, scenario: Scenario) -> Places:
         1 - np.exp(places.log_weights[known]).sum(), _LIMITS.least)))
     return Places(
         select(places.weighted(log_ratio - np.where(known, log_prior, 0.0)), known), log_rest,
-        farthest_m, float(np.log(np.ptp(scenario.roi_bounds_m, axis=0)).sum()))
+        farthest_m, log_size(scenario.roi_bounds_m))
 
 
 def log_evidence(sightings: Sequence[Sighting], log_shares: Sequence[float],

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Pose
-from rhs_isac_ros.model.arrays import blocks, mixture_weights
+from rhs_isac_ros.model.arrays import blocks, log_size, mixture_weights
 from rhs_isac_ros.model.gaussian import share_of_level
 from rhs_isac_ros.positioning import prior as priors
 from rhs_isac_ros.positioning.alternatives import (
@@ -584,17 +584,16 @@ class _Found(NamedTuple):
         estimator, estimate, fit = self.estimator, self.estimate, self.fit
         assert fit is not None
         mixture, sheets = fit.describe()
-        size = np.ptp(estimator._bounds, axis=0)
-        log_evidence = fit.log_evidence + float(np.log(size[size > 0]).sum())
+        bounds_m = estimator._bounds
         blocked = float(np.nan_to_num(estimate.blocked_probability))
         pose = estimator.scenario.pose
         placed = mixture.scaled(estimator._scale(fit)).moved(Pose(), pose)
         log_ratio = self.log_ratios.get(Outside.name, -np.inf)
         places = places_of(self.outside(), log_ratio, estimator.scenario) if (
-            self.outside and size.all() and np.isfinite(log_ratio)) else None
+            self.outside and np.ptp(bounds_m, axis=0).all() and np.isfinite(log_ratio)) else None
         return Sighting(
-            pose, placed.weighted(log_evidence),
+            pose, placed.weighted(fit.log_evidence + log_size(bounds_m)),
             float(np.clip(blocked + (1 - blocked) * MISS_PROBABILITY, 0.0, 1 - 1e-12)), sheets,
             misfit_log_ratio=misfit_log_ratio(fit.residual, estimator._n_measurements),
-            places=places, region_m=estimator._bounds,
+            places=places, region_m=bounds_m,
             **{f'{name}_log_ratio': value for name, value in self.log_ratios.items()})

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import checked_bounds, mixture_weights
+from rhs_isac_ros.model.arrays import checked_bounds, log_size, mixture_weights
 from rhs_isac_ros.model.gaussian import likelihood_loss, moments, step_to_maximum, symmetric
 from rhs_isac_ros.model.geometry import polar_derivative, to_positions
 from rhs_isac_ros.model.pose import Pose
@@ -169,11 +169,6 @@ def _log_average(sheets: Sheets, bounds_m: np.ndarray) -> float:
     return _inside(sheets, bounds_m, _AT_SURFACE, to_positions(points)).log_mass
 
 
-def _log_size(bounds_m: np.ndarray) -> float:
-    """Return the logarithm of the volume of a box, which may have no extent along an axis."""
-    return float(np.log(np.maximum(np.ptp(bounds_m, axis=0), _LIMITS.extent_m)).sum())
-
-
 def _smallest_box(bounds_m: np.ndarray, pose: Pose) -> np.ndarray:
     """Return the bounds of the smallest box in the frame of a surface that contains a box."""
     corners = pose.to_surface(np.stack(np.meshgrid(*bounds_m.T), axis=-1).reshape(-1, 3))
@@ -235,7 +230,9 @@ class _Factor(NamedTuple):
                 np.append(inside.log_weights - log_total, np.log(sighting.missing)),
                 np.append(inside.means, centre[None], axis=0),
                 np.append(inside.covariances, regular(np.diag(size**2 / 12))[None], axis=0))),
-            min(log_average + _log_size(bounds_m) - _log_size(region_m), 0.0),
+            # The region of the site may have no extent along an axis, and that of the surface one.
+            min(log_average + log_size(bounds_m, _LIMITS.extent_m)
+                - log_size(region_m, _LIMITS.extent_m), 0.0),
             -statistics.median([*curvature[:, 0, 0].tolist(), 0.0]))
 
     def term(self, chosen: np.ndarray) -> Term:

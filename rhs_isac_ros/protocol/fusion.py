@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rhs_isac_ros.bounds import site_crlb
+from rhs_isac_ros.model.arrays import log_size
 from rhs_isac_ros.positioning import Estimate, Mixture, Sighting
 from rhs_isac_ros.positioning.agreement import PoseTest, pair_agreements
 from rhs_isac_ros.positioning.alternatives import LIMIT, Outside
@@ -80,12 +81,6 @@ def _heaviest(gaussians: _MixtureT) -> _MixtureT:
 
 def _values(message: m.Posterior, names: Sequence[str]) -> list[Any]:
     return [getattr(message, name) for name in names]
-
-
-def _log_size(bounds_m: np.ndarray) -> float:
-    """Return the logarithm of the volume of a region, without the axes along which it has none."""
-    size = np.ptp(bounds_m, axis=0)
-    return float(np.log(size[size > 0]).sum())
 
 
 @dataclasses.dataclass
@@ -270,9 +265,9 @@ class Fusion(Role):
             crlb_m2=self._bound_m2(answers, fused.mean),
             estimator=f'fusion of {", ".join(answers)}', latency_s=latency_s, **common))
         # The agreement is relative to a different user in the region of each surface.
-        averages = (one.log_evidence - _log_size(self._surfaces[name].scenario.roi_bounds_m)
+        averages = (one.log_evidence - log_size(self._surfaces[name].scenario.roi_bounds_m)
                     for name, one in answers.items())
-        log_evidence = float(fused.log_agreement) + _log_size(self._bounds_m) + sum(averages)
+        log_evidence = float(fused.log_agreement) + log_size(self._bounds_m) + sum(averages)
         missing = math.prod(one.missing for one in sightings.values())
         self.send(posterior_of(source, Sighting(
             self._pose, fused.mixture.weighted(log_evidence), missing), **common))

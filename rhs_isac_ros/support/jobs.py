@@ -243,11 +243,10 @@ def as_json(value: Any) -> Any:
 def _check_keys(value: Any) -> None:
     """Raise TypeError unless all keys are texts: in JSON, 1 and '1' would be the same key."""
     if isinstance(value, Mapping):
-        for key in value:
-            if not isinstance(key, str):
-                raise TypeError(f'key {key!r}, expected texts as keys')
-    for one in value.values() if isinstance(value, Mapping) else (
-            value if isinstance(value, list | tuple) else ()):
+        if wrong := [key for key in value if not isinstance(key, str)]:
+            raise TypeError(f'key {wrong[0]!r}, expected texts as keys')
+        value = [*value.values()]
+    for one in value if isinstance(value, list | tuple) else ():
         _check_keys(one)
 
 

@@ -18,7 +18,7 @@ from rhs_isac_ros.link import (
     steer,
 )
 from rhs_isac_ros.model import ElementErrors, MeasurementModel, mobility, simulate_received
-from rhs_isac_ros.model.arrays import checked_positions, numbers, untied
+from rhs_isac_ros.model.arrays import checked_positions, log_size, numbers, untied
 from rhs_isac_ros.model.geometry import element_positions
 from rhs_isac_ros.model.los import los_and_derivative, los_gain
 from rhs_isac_ros.positioning import SignalError, make_estimator
@@ -142,3 +142,8 @@ def test_of_values_that_are_equal_up_to_rounding_the_first_is_the_smallest():
     for one in (values, -values):
         assert np.argmin(untied(one[:3])) == 0
     assert np.argsort(untied(np.stack([values, values]))).tolist() == [[3, 0, 1, 2]] * 2
+
+
+def test_a_box_without_extent_along_an_axis_has_an_area():
+    assert log_size(np.array([[0, 0, 1], [2, 3, 1]])) == pytest.approx(np.log(6))
+    assert log_size(np.array([[0, 0, 1], [2, 3, 1]]), 0.5) == pytest.approx(np.log(3))

@@ -29,9 +29,9 @@ def sighting(place, pose, rng, n_candidates=1, assumed=None):
         assumed.covariances_to_site(covariances)))
 
 
-def sightings(rng, n=40, n_candidates=1, n_outliers=0, start=START):
+def sightings(rng, n=40, n_candidates=1, n_outliers=0, start=START, bounds_m=BOUNDS):
     """Return the sightings of both surfaces; outliers are different users at each surface."""
-    places, others = rng.uniform(*BOUNDS, size=(2, n, 3))
+    places, others = rng.uniform(*bounds_m, size=(2, n, 3))
     seen = np.where((np.arange(n) < n_outliers)[:, None], others, places)
     return ([sighting(place, FRONT, rng, n_candidates) for place in places],
             [sighting(place, SIDE, rng, n_candidates, SIDE.displaced(start)) for place in seen])
@@ -55,6 +55,14 @@ def test_a_pose_is_found_with_a_covariance_that_fits_its_error(n, seeds):
 def test_wrong_candidates_and_outliers_do_not_matter():
     found = estimate_pose(*sightings(
         np.random.default_rng(1), n_candidates=4, n_outliers=6), BOUNDS)
+    assert np.linalg.norm(found.error_of(SIDE)[:3]) < 0.15
+    assert normalised_error(found) < 25
+
+
+def test_users_in_a_plane_determine_a_pose():
+    plane = BOUNDS * [1, 1, 0]
+    found = estimate_pose(*sightings(
+        np.random.default_rng(1), n_candidates=4, n_outliers=6, bounds_m=plane), plane)
     assert np.linalg.norm(found.error_of(SIDE)[:3]) < 0.15
     assert normalised_error(found) < 25
 
