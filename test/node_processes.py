@@ -40,6 +40,14 @@ EXECUTABLES = Path(get_package_prefix('rhs_isac_ros')) / 'lib' / 'rhs_isac_ros'
 STEPS = {'step_timeout_s': 10.0, 'retries': 39}
 
 
+def messages_of_cycle(n_bands):
+    """Return the number of messages of each class in a served cycle without repetitions."""
+    return {m.Grant: 1, m.ReceivedSignals: 1, m.PositionEstimate: 1, m.Beam: 1, m.Capacity: 1,
+            m.CapacityStatistics: 1, m.GroundTruth: 1, m.RhsCommand: n_bands,
+            m.RhsConfiguration: n_bands + 1, m.PilotRequest: 1, m.Pilot: n_bands,
+            m.FeedSignals: n_bands, m.Data: 4, m.ProtocolState: 4}
+
+
 class Process:
     """A process of an executable, whose output goes to a file."""
 
@@ -137,8 +145,8 @@ class Watch(Bench):
         self.node = self.add(Node, 'watch', namespace=namespace)
         self.received = {kind: [] for kind in topics.NAMES}
         self._of_cycle = collections.defaultdict(list)
-        # Final states of the served cycles, in order.
-        self.served = []
+        # Final states of cycles that were served, in order of arrival.
+        self.ends = []
         # Functions by message class, called with each message.
         self.hooks = {}
         # Clients of parameters by node.
@@ -153,7 +161,7 @@ class Watch(Bench):
         self.received[kind].append(plain)
         self._of_cycle[kind, getattr(plain, 'cycle_id', None)].append(plain)
         if kind is m.ProtocolState and plain.outcome == 'served':
-            self.served.append(plain)
+            self.ends.append(plain)
         if kind in self.hooks:
             self.hooks[kind](plain)
 
@@ -197,6 +205,20 @@ class Watch(Bench):
     def of_cycle(self, kind, cycle_id):
         return list(self._of_cycle[kind, cycle_id])
 
+    def _received(self, ends):
+        """Return the ends of cycles of which messages of each class have arrived.
+
+        DDS discovers each topic on its own: an observer may receive the end of a cycle before it
+        knows the other topics, and messages of one topic before earlier ones of another.
+        """
+        kinds = messages_of_cycle(1)
+        return [end for end in ends if all(self._of_cycle[kind, end.cycle_id] for kind in kinds)]
+
+    @property
+    def served(self):
+        """Final states of the served cycles of which all messages have arrived, in order."""
+        return self._received(self.ends)
+
     @property
     def given_up(self):
         """Final states of cycles that failed; signals without a position are no failure."""
@@ -205,10 +227,10 @@ class Watch(Bench):
 
     def until_served(self, n=1, user=None, processes=()):
         """Wait for n more served cycles, of one user or of any, and return their final states."""
-        before = len(self.served)
+        before = len(self.ends)
 
         def new_ends():
-            ends = [end for end in self.served[before:] if user in (None, end.user)]
+            ends = [end for end in self._received(self.ends[before:]) if user in (None, end.user)]
             return ends if len(ends) >= n else None
         return self.until(new_ends, f'{n} more cycles of user {user}', processes)
 

@@ -5,6 +5,7 @@ import signal
 import types
 
 import pytest
+from node_processes import messages_of_cycle
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
@@ -12,13 +13,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.messages import check
 
 SCENARIO = Scenario()
-SIZES = SCENARIO.sizes
-# Number of messages of each class in one cycle.
-COMPLETE = {m.Grant: 1, m.ReceivedSignals: 1, m.PositionEstimate: 1, m.Beam: 1, m.Capacity: 1,
-         m.CapacityStatistics: 1, m.GroundTruth: 1, m.RhsCommand: SIZES['N_B'],
-         m.RhsConfiguration: SIZES['N_B'] + 1,
-         m.PilotRequest: 1, m.Pilot: SIZES['N_B'],
-         m.FeedSignals: SIZES['N_B'], m.Data: 4, m.ProtocolState: 4}
+COMPLETE = messages_of_cycle(SCENARIO.sizes['N_B'])
 # Also on a busy machine, a step is repeated only if a message is lost. A cycle without its user
 # ends soon.
 STEPS = {'step_timeout_s': 4.0, 'retries': 1}

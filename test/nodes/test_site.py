@@ -260,7 +260,7 @@ def test_data_of_walking_users_move_to_another_surface(running):
         front, side = ({one.user for one in carried} for carried in data)
         carried = {one.cycle_id for of_surface in data for one in of_surface}
         # The base station may have found the topic of a surface earlier than the observer.
-        return front & side and {end.cycle_id for end in running.front.served[-6:-1]} <= carried
+        return front & side and {end.cycle_id for end in running.front.ends[-6:-1]} <= carried
     running.until(moved, 'a handover')
     for name, data in running.delivered().items():
         assert {one.scenario_id for one in data} == {running.site.surfaces[name].scenario.id}
@@ -373,10 +373,11 @@ def test_the_others_continue_without_nodes_of_one_surface(running, roles):
         process.signal(signal.SIGKILL)
         process.wait()
     # Observers may have missed the last messages of the processes, and the latest grant.
-    latest = max(grant.cycle_id for grant in running.front.received[m.Grant]) + 1
+    latest = max(running.until(lambda: [
+        grant.cycle_id for grant in running.front.received[m.Grant]], 'a grant')) + 1
 
     def continued():
-        return [end for end in running.front.served if end.cycle_id > latest] and [
+        return [end for end in running.front.ends if end.cycle_id > latest] and [
             one for one in running.fused.received[m.PositionEstimate] if one.cycle_id > latest]
     estimates = running.until(continued, 'a position')
     # Without its optimizer, a surface keeps its codebook.
