@@ -31,7 +31,7 @@ class SurfaceFault(Exception):
 
 @runtime_checkable
 class Surface(Protocol):
-    """A surface whose elements have adjustable coefficients."""
+    """A surface whose elements have adjustable tunings."""
 
     @property
     def n_elements(self) -> int:
@@ -46,7 +46,8 @@ class Surface(Protocol):
     def apply(self, configuration: ArrayLike) -> None:
         """Show a configuration, [n_elements], and return when the surface has confirmed it.
 
-        The order of the elements is that of `element_positions`. Raises ValueError if the surface
+        It contains a tuning in [0, 1] for each element, in the order of `element_positions`. With
+        L `amplitude_levels`, the tuning of the level or state n, from 0, is n / (L - 1). Raises ValueError if the surface
         cannot show such a configuration, and SurfaceFault if it does not confirm it. After a
         fault, the next call tries again, without a restart.
         """
@@ -67,7 +68,7 @@ class EmulatedSurface:
         self.applied = np.zeros(n_elements)
 
     def apply(self, configuration: ArrayLike) -> None:
-        """Show a configuration: coefficients from 0 to 1."""
+        """Show a configuration, tunings from 0 to 1."""
         self.applied = checked(configuration, self.n_elements)
 
     def close(self) -> None:
@@ -77,7 +78,7 @@ class EmulatedSurface:
 def checked(configuration: ArrayLike, n_elements: int, is_binary: bool = False) -> np.ndarray:
     """Return a copy of a configuration, float64 [n_elements], or raise ValueError.
 
-    Its coefficients are from 0 to 1, or either of them if `is_binary` is set.
+    Its tunings are from 0 to 1, or either of them if `is_binary` is set.
     """
     values = np.array(numbers('configuration', configuration, shapes=[(n_elements,)]))
     is_valid = (values == 0) | (values == 1) if is_binary else (0 <= values) & (values <= 1)
