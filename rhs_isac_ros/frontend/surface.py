@@ -47,9 +47,9 @@ class Surface(Protocol):
         """Show a configuration, [n_elements], and return when the surface has confirmed it.
 
         It contains a tuning in [0, 1] for each element, in the order of `element_positions`. With
-        L `amplitude_levels`, the tuning of the level or state n, from 0, is n / (L - 1). Raises ValueError if the surface
-        cannot show such a configuration, and SurfaceFault if it does not confirm it. After a
-        fault, the next call tries again, without a restart.
+        L `amplitude_levels`, the tuning of the level or state n, from 0, is n / (L - 1). Raises
+        ValueError if the surface cannot show such a configuration, and SurfaceFault if it does not
+        confirm it. After a fault, the next call tries again, without a restart.
         """
         ...
 

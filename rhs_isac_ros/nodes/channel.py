@@ -9,7 +9,7 @@ from rhs_isac_ros.frontend import Air, FrontEnd, Radio, SampleRecorder, make_rad
 from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol.channel import Channel, apply_patterns
-from rhs_isac_ros.ros.endpoints import BackgroundWorker
+from rhs_isac_ros.ros.endpoints import BackgroundWorker, surviving
 from rhs_isac_ros.ros.parameters import calibrated_surface
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
@@ -76,7 +76,7 @@ class ChannelNode(RoleNode[Channel]):
     def report(self) -> Report:
         """Return the diagnostics, with those of the radio."""
         of_radio: Mapping[str, str] = {}
-        with self.noting():
+        with surviving(self):
             of_radio = self._front_end.status()
         report = super().report()
         return dataclasses.replace(report, details={**report.details, **of_radio})

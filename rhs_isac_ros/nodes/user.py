@@ -297,7 +297,7 @@ class UserNode(RoleNode[User]):
         if self._robot and self._robot.lack:
             return
         role, now_s, stamp = self.role, self.now_s(), self.get_clock().now().to_msg()
-        with self.noting():
+        with endpoints.surviving(self):
             self._publish_truths(role.ground_truths(now_s), stamp)
 
     def _publish_truths(self, truths: m.GroundTruths, stamp: Time) -> None:

@@ -34,7 +34,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.support.plugins import PluginError, trace_of
+from rhs_isac_ros.support.plugins import PluginError
 from rhs_isac_ros.support.state_log import Line, StateLog
 
 
@@ -110,12 +110,16 @@ def steady_timer(node: Node, period_s: float, callback: Callable[[], float | Non
 
 @contextlib.contextmanager
 def surviving(node: Node) -> Iterator[None]:
-    """Let a node log the failure of a plug-in in a block, and live on."""
+    """Let the node of a role note the failure of a plug-in in a block, and live on.
+
+    Its method `note` takes the error. Other nodes have no plug-ins, and raise it.
+    """
     try:
         yield
     except PluginError as error:
-        text = f'plug-in: {error}'
-        journal(node).event(text, text + trace_of(error.__cause__))
+        if not (note := getattr(node, 'note', None)):
+            raise
+        note(error)
 
 
 def set_period(timer: Timer, period_s: float | None) -> None:
@@ -382,8 +386,8 @@ class BackgroundWorker:
     def run(self, job: Callable[[], _Result], on_result: Callable[[_Result], None]) -> None:
         """Queue a job; the thread that spins the node passes the result to `on_result`.
 
-        That thread also raises exceptions of the job, except for failures of plug-ins, which it
-        logs.
+        That thread also raises exceptions of the job, except for failures of plug-ins, which the
+        node notes.
         """
         def hand_over(future: Future[_Result]) -> None:
             self._done.append((future, on_result))

@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.srv import GetParameters
@@ -391,13 +391,9 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             case _:
                 self.execute(action)
 
-    @contextlib.contextmanager
-    def noting(self) -> Iterator[None]:
-        """Note a failure of a plug-in in a block, as the role does when it handles an event."""
-        try:
-            yield
-        except PluginError as error:
-            self._perform(self.role.noted(error))
+    def note(self, error: PluginError) -> None:
+        """Count and log a failure of a plug-in, as the role does when it handles an event."""
+        self._perform(self.role.noted(error))
 
     def _on_timer(self) -> None:
         self._timer.cancel()

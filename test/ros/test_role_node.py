@@ -12,7 +12,7 @@ from ros_messages import to_ros
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.events import LogMessage, Send, Timeout
 from rhs_isac_ros.protocol.role import Role
-from rhs_isac_ros.ros import role_node
+from rhs_isac_ros.ros import endpoints, role_node
 from rhs_isac_ros.ros.role_node import Clocks, RoleNode
 from rhs_isac_ros.support import plugins
 
@@ -122,12 +122,21 @@ def test_a_node_survives_a_plug_in_that_fails_and_logs_its_traceback(bench, star
         def react(self, event):
             with plugins.calling('Grid.estimate'):
                 raise KeyError(event.key)
+    def fail(place):
+        with plugins.calling(place):
+            return 1 / 0
     node = start(bench, role := Failing())
     node.dispatch(LogMessage('', key='gain'))
-    with node.noting():
+    with endpoints.surviving(node):
         raise plugins.PluginError('Circle.state: nothing')
-    assert role.counters == {'plugin_fault': 2}
+    worker = endpoints.BackgroundWorker(node)
+    node.endings.callback(worker.close)
+    worker.run(lambda: fail('job'), lambda result: None)
+    timer = endpoints.steady_timer(node, 0.01, lambda: (timer.cancel(), fail('timer')))
+    bench.until(lambda: role.counters == {'plugin_fault': 4})
     log = capfd.readouterr().err
+    assert all(f'plug-in: {place}: ZeroDivisionError: division by zero\nTraceback' in log
+               for place in ('job', 'timer'))
     assert "plug-in: Grid.estimate: KeyError: 'gain'\nTraceback" in log
     assert 'raise KeyError(event.key)' in log and 'plug-in: Circle.state: nothing' in log
 
