@@ -11,8 +11,8 @@ from typing import Any
 
 from rhs_isac_ros.bounds import crlb_of
 from rhs_isac_ros.calibration import Calibration
-from rhs_isac_ros.codebook import band_plan, library_command
-from rhs_isac_ros.codebook.codebook import Codebook
+from rhs_isac_ros.codebook import band_plan, library
+from rhs_isac_ros.codebook.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.codebook.objective import OBJECTIVES, SAMPLINGS
 from rhs_isac_ros.codebook.optimize import (
     DEFAULT_POSITIONS,
@@ -51,6 +51,10 @@ from rhs_isac_ros.support.progress import progress_bar
 HELD_OUT_POSITIONS = 2000
 # With more positions, the samples would fill the memory.
 _MAX_POSITIONS = 10**5
+_LIBRARY = (
+    'Optimise a library of codebooks, one for each cell of the region and uncertainty of a '
+    'position. The size of the cells follows from the loss. Results of an unfinished run are kept '
+    'in OUTPUT.jobs; repeat the command to continue it.')
 # Errors that the user can correct; the command prints their messages.
 ERRORS = (JobError, MissingLibraryError, ValueError, ConnectionError, MemoryError)
 
@@ -59,20 +63,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return the code of `exit_code_of`, 0 even if Ctrl-C ends the search.
 
     The exit code is 130 if Ctrl-C ends jobs, which writes no codebook. If the first argument is
-    ``library``, the others are those of `library_command`.
+    ``library``, the others are the options of a library.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
-    if arguments[:1] == ['library']:
-        return library_command.main(arguments[1:])
+    is_library = arguments[:1] == ['library']
     parser = ArgumentParser(
-        prog='python3 -m rhs_isac_ros.codebook', description=__doc__,
+        prog='python3 -m rhs_isac_ros.codebook' + is_library * ' library',
+        description=_LIBRARY if is_library else __doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    add_options(parser)
-    options = parser.parse_args(arguments)
-    check(parser, options)
+    (_add_library_options if is_library else add_options)(parser)
+    options = parser.parse_args(arguments[is_library:])
+    (check_distinct if is_library else check)(parser, options)
 
     def work() -> None:
-        run(options)
+        if is_library:
+            _run_library(options)
+        else:
+            run(options)
     return exit_code_of(work, ERRORS, parser.prog)
 
 
@@ -253,6 +260,44 @@ def _save_partial(result: OptimizeResult, partial: Path) -> None:
 def _value(progress: Progress) -> str:
     return ('setting up the objective' if math.isinf(progress.value_m2)
             else f'{progress.value_m2:.5f} m^2')
+
+
+def _add_library_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add('--output', type=output_file, default='library.npz', help='file to write')
+    add('--scenario', '--config', type=input_file,
+        help="YAML file of the scenario; the paper's Table I if omitted")
+    add('--start', type=input_file,
+        help='codebook of the whole region, from which each optimisation starts; '
+             'config/codebook.yaml if omitted')
+    # The bound alone ignores range ambiguities, which then return.
+    add('--objective', choices=('ambiguity', 'error'), default='error',
+        help='confusion of positions in the cell, or this confusion weighted almost as in the '
+             'squared error')
+    add('--spreads', type=positive_float, nargs='+', default=library.SPREADS_M, metavar='M',
+        help='standard deviations of the coordinates of a predicted position [m]')
+    add('--loss', type=positive_float, default=library.LOSS,
+        help='largest relative loss due to the size of the cells')
+    add('--quiet', action='store_true', help='show no progress')
+    add_run_options(parser)
+
+
+def _run_library(options: argparse.Namespace) -> None:
+    """Optimise a library of codebooks, write its file and print a summary."""
+    def print_loss(spread_m: float, pitch_m: float, loss: float) -> None:
+        if not options.quiet:
+            print(f'spread {spread_m:g} m, cells of {pitch_m:g} m: loss {100 * loss:.1f} %',
+                  file=sys.stderr)
+
+    scenario = Scenario.from_yaml(options.scenario) if options.scenario else Scenario()
+    start = Codebook.load(options.start or default_codebook_file(), scenario)
+    with unfinished(options.output, options, options.quiet) as workers:
+        made = library.make_library(scenario, start, options.objective, sorted(options.spreads),
+                                    options.loss, print_loss, workers)
+        save_or_rescue(made.save, options.output)
+    numbers = ', '.join(f'{(made.spreads_m == spread_m).sum()} for {spread_m:g} m'
+                        for spread_m in made.plan.spreads_m)
+    print(f'{options.output}: {made.id}, {len(made.codebooks)} codebooks: {numbers}')
 
 
 if __name__ == '__main__':

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rhs_isac_ros.codebook import CodebookError, library, library_command, random_codebook
+from rhs_isac_ros.codebook import CodebookError, library, random_codebook
+from rhs_isac_ros.codebook.__main__ import main
 from rhs_isac_ros.codebook.library import Library, Plan
 from rhs_isac_ros.codebook.objective import OBJECTIVES, sobol
 from rhs_isac_ros.model import Scenario
@@ -172,9 +173,9 @@ def test_the_command_continues_after_an_interruption_and_on_other_workers(
 
     with monkeypatch.context() as patch:
         patch.setattr(library, 'optimised', interrupted)
-        assert library_command.main([*arguments, '1']) == 130
+        assert main(['library', *arguments, '1']) == 130
     assert len([*(tmp_path / 'library.npz.jobs').glob('optimisation-*')]) == 3
-    assert library_command.main([*arguments, '2']) == 0
+    assert main(['library', *arguments, '2']) == 0
     assert '5 codebooks: 4 for 0.1 m, 1 for 0.4 m' in capsys.readouterr().out
     assert Library.load(output).id == library.make_library(
         dataclasses.replace(SCENARIO, roi_size_m=(1, 1, 0.5)), start, 'ambiguity', (0.1, 0.4),
