@@ -11,6 +11,8 @@ from rhs_isac_ros.model.scenario import Scenario, ScenarioError
 
 # Standard deviation of the multipath level of a user without a direct path [dB].
 BLOCKED_STD_DB = 10.0
+# Logarithms of energies per number at which averages over a level are known: ends and step.
+_LOG_ENERGIES = -7.0, 14.0, 0.01
 # Share of valid signals that a test of the energy of a positioning phase may reject.
 FALSE_ALARM = 1e-9
 # Smallest square of a pivot relative to the largest variance, in units of the rounding error of n
@@ -110,6 +112,29 @@ def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: 
     level, prior = POWER_NEPERS_PER_DB * median_db + std * normal, -normal**2 / 2
     exponents = -energy[:, None] * np.exp(-level) - n * level + prior
     return mixture_weights(exponents)[1] - mixture_weights(prior)[1]
+
+
+class UnknownLevel:
+    """Averages of likelihoods over the level of the multipath, a log-normal power.
+
+    The level is that of n complex Gaussian numbers, with a median and a standard deviation [dB].
+    By default, it is known to be 0 dB.
+    """
+
+    def __init__(self, n: int = 1, level_db: tuple[float, float] = (0.0, 0.0)) -> None:
+        self.is_known = level_db == (0.0, 0.0)
+        self._log_energies = np.log(n) + np.arange(*_LOG_ENERGIES)
+        energies = np.exp(self._log_energies)
+        self._gains = np.zeros(len(energies)) if self.is_known else (
+            log_evidence_of_level(energies, n, level_db[1], level_db[0]) + energies)
+
+    def gain(self, energy: np.ndarray) -> np.ndarray:
+        """Return logs of averages relative to likelihoods at 0 dB, for residual energies [...]."""
+        return np.interp(np.log(np.maximum(energy, np.finfo(float).tiny)),
+                         self._log_energies, self._gains)
+
+
+AT_0_DB = UnknownLevel()
 
 
 def share_of_level(n: float, std_db: float) -> float:

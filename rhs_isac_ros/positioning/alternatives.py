@@ -5,7 +5,8 @@ comparison with the evidence for a user in the region gives the probability of t
 Both average over errors and failures of the elements in the same way, without regard to what the
 signals reveal about single elements. Where this leaves a doubt, all have the sets of failed
 elements that are found for them. All parameters, such as an offset of the timing, are those
-that fit the alternative.
+that fit the alternative. If a survey has measured how much the level of the multipath varies among
+users, the evidences of all are averaged over it: with weak multipath, signals say more.
 
 There is a fix only if a user in the region and in sight is at least as probable as all
 alternatives together, which is the decision with the least error, and if the probability of each
@@ -20,10 +21,9 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model import MeasurementModel, Scenario, gaussian
 from rhs_isac_ros.model.arrays import blocks, log_sum, marked
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
-from rhs_isac_ros.model.gaussian import BLOCKED_STD_DB, log_bessel, log_evidence_of_level
 from rhs_isac_ros.model.geometry import element_positions, to_positions
 from rhs_isac_ros.positioning.dispersed import ONE_STATE, SurfaceState
 from rhs_isac_ros.positioning.grid import separate
@@ -118,10 +118,6 @@ _OFFSETS = _Offsets()
 class Blocked:
     """A user without a direct path, whose signals are multipath of an unknown level.
 
-    The evidence for a user in sight is computed as if all users had the same level. An average
-    over their levels would multiply this evidence by a factor. Only its ratio to the evidence for
-    a blocked user counts, so the latter is divided by this factor instead.
-
     The attributes are those of `Outside`.
     """
 
@@ -133,21 +129,20 @@ class Blocked:
         self.log_odds = log_odds_of(scenario.blocked_probability)
         self._median_db, self._std_db = scenario.multipath_level_db
 
-    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residuals: np.ndarray,
-                        prior: NuisancePrior) -> np.ndarray:
+    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, prior: NuisancePrior
+                        ) -> np.ndarray:
         """Compute log evidences from the energies of the signals; see `Outside`."""
         # The gain of the user is part of the level.
         gain_db = min(prior.gain_std / NEPERS_PER_DB, _UNKNOWN_GAIN_DB)
-        std_db = math.hypot(BLOCKED_STD_DB, self._std_db, gain_db)
-        in_sight = log_evidence_of_level(residuals, self._n, self._std_db, self._median_db)
+        std_db = math.hypot(gaussian.BLOCKED_STD_DB, self._std_db, gain_db)
         blocked = np.logaddexp.reduce([
-            state.offset + log_evidence_of_level(
+            state.offset + gaussian.log_evidence_of_level(
                 state.energy(whitened), self._n, std_db, self._median_db)
             for state in self._states])
         if prior.gain_std:
             # Relative to the density of an unknown gain that positions assume.
             blocked += math.log(gain_db * NEPERS_PER_DB / prior.gain_unit)
-        return blocked - (in_sight + residuals) + prior.log_evidence_of_aligned(aligned)
+        return np.asarray(blocked + prior.log_evidence_of_aligned(aligned))
 
     def seen(self, model: MeasurementModel, received: np.ndarray, whitened: np.ndarray
              ) -> np.ndarray:
@@ -167,7 +162,7 @@ class Blocked:
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether a plausible level explains signals up to this residual energy."""
         energy = float(np.sum(np.abs(whitened)**2))
-        return energy <= max_residual * 10**(_LEVEL_REACH * BLOCKED_STD_DB / 10)
+        return energy <= max_residual * 10**(_LEVEL_REACH * gaussian.BLOCKED_STD_DB / 10)
 
 
 def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] | None = None
@@ -231,12 +226,13 @@ class Outside:
     strength = 0.5
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray],
-                 states: Sequence[SurfaceState] = ONE_STATE) -> None:
+                 states: Sequence[SurfaceState] = ONE_STATE,
+                 level: gaussian.UnknownLevel = gaussian.AT_0_DB) -> None:
         # Logarithm of the prior odds relative to a user inside and in sight.
         self._probability = scenario.outside_probability
         self.log_odds = log_odds_of(self._probability)
         self._basis = arrays['outer_basis']
-        self._templates = [_Templates(scenario, arrays, state) for state in states]
+        self._templates = [_Templates(scenario, arrays, state, level) for state in states]
 
     def seen(self, model: MeasurementModel, received: np.ndarray, whitened: np.ndarray
              ) -> np.ndarray:
@@ -252,14 +248,13 @@ class Outside:
         changed.log_odds = log_odds_of(wrong * self._probability)
         return changed
 
-    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, residuals: np.ndarray,
-                        prior: NuisancePrior) -> np.ndarray:
+    def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, prior: NuisancePrior
+                        ) -> np.ndarray:
         """Compute logarithms of evidences with the nuisance parameters integrated out, [N].
 
         `aligned`, float64 [N, Q], contains the parameters that follow from the signals alone, and
         0 for the others. `whitened`, complex128 [N, N_B, N_SB F], are the signals of N shots
-        without the factors of `aligned`. `residuals`, [N], are the residual energies at the best
-        positions inside.
+        without the factors of `aligned`.
         """
         found: np.ndarray = np.logaddexp.reduce([
             one.log_evidence_of(whitened, prior) for one in self._templates])
@@ -296,8 +291,9 @@ class _Templates:
     """The templates of `tabulate_outside` for one state of the surface."""
 
     def __init__(self, scenario: Scenario, arrays: Mapping[str, np.ndarray],
-                 state: SurfaceState = ONE_STATE[0]) -> None:
-        self._state = state
+                 state: SurfaceState = ONE_STATE[0],
+                 level: gaussian.UnknownLevel = gaussian.AT_0_DB) -> None:
+        self._state, self._level = state, level
         self._filters, self._index = arrays['outer_filters'], arrays['outer_index']
         ranges = _ranges(scenario)[:, None]
         self._directions, self._carriers = _directions(scenario), carrier_wavenumbers(scenario)
@@ -362,18 +358,23 @@ class _Templates:
             arguments, total = arguments * factor, total * factor
         mean = of_shot.max(total.max(axis=0)) / n_bands
         largest = np.maximum(of_shot.max(highest.max(axis=0)), np.finfo(np.float32).min)
-        least = largest - GRID.margin - n_bands * (mean - log_bessel(mean))
+        least = largest - GRID.margin - n_bands * (mean - gaussian.log_bessel(mean))
         (chosen,) = (highest >= of_shot.repeat(least)).ravel().nonzero()
         arguments = arguments.reshape(n_bands, -1).take(chosen, axis=1)
         ranges, pairs = np.divmod(chosen, len(shot))
         shot, direction = shot[pairs], direction[pairs]
         logs = value.take(chosen) + offset.take(chosen).astype(float) + np.sum(
-            log_bessel(arguments) - arguments, axis=0)
+            gaussian.log_bessel(arguments) - arguments, axis=0)
+        power = energy[shot]
         if prior.gain_std:
             # Laplace's integral over the gain, which hardly changes the Bessel functions.
-            power = np.exp(-2 * gain.take(chosen)) * energy[shot]
+            power *= np.exp(-2 * gain.take(chosen))
             logs -= np.log(4 * power - total.take(chosen) + prior.gain_std**-2) / 2 + math.log(
                 prior.gain_unit)
+        if not self._level.is_known:
+            logs += self._level.gain(power + self._energy[ranges, direction] - total.take(chosen))
+            largest = np.full(len(largest), np.finfo(np.float32).min, float)
+            np.maximum.at(largest, shot, logs)
         return shot, ranges, direction, logs, largest
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
@@ -452,7 +453,7 @@ def describe_doubts(estimate: object) -> str:
 
 def log_ratios_of(
         alternative: Alternative, likelihood: Likelihood, signals: Signals, seen: np.ndarray,
-        aligned: np.ndarray, shadow: np.ndarray, residuals: np.ndarray, in_sight: np.ndarray
+        aligned: np.ndarray, shadow: np.ndarray, in_sight: np.ndarray
         ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return log evidences of an alternative relative to a user inside and in sight, [N].
 
@@ -466,13 +467,12 @@ def log_ratios_of(
     prior, values = likelihood.nuisance, shadow + alternative.strength * (aligned - shadow)
     axes = prior.axes
     if not len(axes):
-        found = alternative.log_evidence_of(seen, values, residuals, prior)
+        found = alternative.log_evidence_of(seen, values, prior)
         return found - in_sight, values, seen
 
     def ratios(values: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
         return alternative.log_evidence_of(
-            likelihood.whitened(values, select(signals, rows)), values, residuals[rows], prior
-        ) - in_sight[rows]
+            likelihood.whitened(values, select(signals, rows)), values, prior) - in_sight[rows]
 
     found, log_volume = ratios(values), np.zeros(len(values))
     (near,) = np.nonzero(np.abs(alternative.log_odds + found) < _OFFSETS.near)

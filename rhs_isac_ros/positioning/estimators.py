@@ -12,7 +12,7 @@ import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Pose
 from rhs_isac_ros.model.arrays import blocks, log_size, mixture_weights
-from rhs_isac_ros.model.gaussian import share_of_level
+from rhs_isac_ros.model.gaussian import UnknownLevel, share_of_level
 from rhs_isac_ros.positioning import prior as priors
 from rhs_isac_ros.positioning.alternatives import (
     Alternative,
@@ -120,8 +120,7 @@ class SearchEstimator(abc.ABC):
             self, system: System, table_folder: str | Path | None = None, *,
             reject_outside: bool = False, progress: Callable[[float], None] | None = None,
             lazy: bool = False, left_out: float = MISS_PROBABILITY) -> None:
-        self.system, self.scenario = system, system.scenario
-        scenario = system.scenario
+        self.system, self.scenario = system, (scenario := system.scenario)
         self._likelihood = likelihood = Likelihood(system)
         self._rejects_outside = reject_outside and bool(scenario.outside_probability)
         self.left_out: float = Field(
@@ -130,9 +129,9 @@ class SearchEstimator(abc.ABC):
             load_table, system, table_folder, progress, model=likelihood.model)
         prior, n_measurements = likelihood.nuisance, likelihood.model.n_whitened
         median_db, std_db = scenario.multipath_level_db
-        # Median multipath level of users in sight, and the share of a residual's deviation that
-        # is due to the level.
+        # Median multipath level of users in sight, and its share of a residual's deviation.
         self._level, self._n_measurements = 10**(median_db / 10), n_measurements
+        self._unknown_level = UnknownLevel(n_measurements, (median_db, std_db))
         self._level_share = share_of_level(n_measurements, std_db)
         self._test = FitTest(n_measurements, self._level, likelihood.scenario.board.declared)
         self._movement = MovementTest.of(system, likelihood)
@@ -167,8 +166,9 @@ class SearchEstimator(abc.ABC):
         scenario = self._likelihood.scenario
         scope = SearchScope.of(self._likelihood, self._load(), lay_grid(scenario), self._blocked)
         if self._rejects_outside:
-            outside = Outside(scenario, self._load(outside=True),
-                              self._averaging.states(MeasurementModel.covariance))
+            outside = Outside(
+                scenario, self._load(outside=True),
+                self._averaging.states(MeasurementModel.covariance), self._unknown_level)
             scope = scope._replace(alternatives=[outside, *scope.alternatives])
         if self.averages and self._is_plain:
             scope = scope._replace(drawn=DrawnPosterior(
@@ -457,9 +457,10 @@ class SearchEstimator(abc.ABC):
             (fit.residual, fit.averaged_evidence, fit.log_evidence - fit.averaged_evidence)
             for fit in fits]).T
         shadow = self._shadow.values_of_each(signals.received, aligned)
+        in_sight = averaged + self._unknown_level.gain(residuals)
         for one in alternatives:
             ratios, values, seen = log_ratios_of(
-                one, self._likelihood, signals, seen, aligned, shadow, residuals, averaged)
+                one, self._likelihood, signals, seen, aligned, shadow, in_sight)
             for n in np.flatnonzero((gains > 0) & (one.log_odds + ratios > _LIMITS.clear)):
                 points, parameters, level = one.places(seen[n], prior)
                 ratios[n] += self._refinement.gain(points, parameters + values[n], Signals(*(

@@ -415,6 +415,9 @@ class Posterior(Message):
                 return f'{log_weights}: {n} components, expected {fewest} to {MAX_COMPONENTS}'
             if problem := covariance_problem(getattr(self, covariances)):
                 return f'{covariances}: {problem}'
+        if len(self.outside_log_weights) and not self.outside_range_m:
+            return (f'outside_range_m: 0, expected the largest range of '
+                    f'{len(self.outside_log_weights)} Gaussians outside of the region')
         try:
             pose = self.surface_pose
         except ValueError as error:

@@ -9,7 +9,7 @@ from scipy.special import logsumexp
 from scipy.stats import binom, norm
 
 from rhs_isac_ros.codebook import Codebook
-from rhs_isac_ros.model import MeasurementModel, Scenario, simulate_received
+from rhs_isac_ros.model import MeasurementModel, Scenario, gaussian, simulate_received
 from rhs_isac_ros.model.arrays import adjoint
 from rhs_isac_ros.model.geometry import to_positions
 from rhs_isac_ros.model.hall import CONDITIONS, MultipathEstimate
@@ -107,8 +107,29 @@ def test_the_evidence_is_the_average_over_an_unknown_gain(random_beams):
     exponent += norm(scale=std).logpdf(gains) - 2 * received.size * gains
     expected = logsumexp(exponent) + np.log(gains[1] - gains[0])
     (found,) = Outside(declared, arrays).log_evidence_of(
-        likelihood.model.whiten(received), np.zeros((1, 1)), np.zeros(1), likelihood.nuisance)
+        likelihood.model.whiten(received), np.zeros((1, 1)), likelihood.nuisance)
     assert found == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.parametrize('level_db', [-3.0, 2.0])
+@pytest.mark.parametrize('median_db, std_db', [(-1.5, 1.2), (0.0, 3.0)])
+def test_the_evidence_is_the_average_over_an_unknown_level(setting, level_db, median_db, std_db):
+    """The multipath of the user is stronger or weaker than the covariance says."""
+    scenario, model, arrays = setting
+    prior, rng = NuisancePrior(model), np.random.default_rng(2)
+    signals = model.whiten(model.sample(np.array([[7.0, 2.0, 1.0]]), rng))
+    signals *= 10**(level_db / 20)
+    normal = np.linspace(-6, 6, 121)
+    levels = 10**((median_db + std_db * normal) / 10)
+    exponent = [alternatives._Templates(scenario, arrays | {
+        'outer_filters': arrays['outer_filters'] / np.float32(level**0.5),
+        'outer_energy': arrays['outer_energy'] / np.float32(level)
+    }).log_evidence_of(signals / level**0.5, prior)[0] - signals.size * np.log(level)
+        for level in levels]
+    expected = logsumexp(exponent + norm().logpdf(normal)) + np.log(normal[1] - normal[0])
+    (found,) = Outside(scenario, arrays, level=gaussian.UnknownLevel(
+        signals.size, (median_db, std_db))).log_evidence_of(signals, np.zeros((1, 0)), prior)
+    assert found == pytest.approx(expected, abs=1.0)
 
 
 def test_the_evidence_is_the_average_over_an_unknown_timing(random_beams):
@@ -125,14 +146,14 @@ def test_the_evidence_is_the_average_over_an_unknown_timing(random_beams):
     values = np.zeros((1201, len(prior)))
     values[:, timing] = np.linspace(-4, 4, len(values))
     exponent = outside.log_evidence_of(
-        likelihood.whitened(values, signals), np.zeros_like(values), np.zeros(1), prior
+        likelihood.whitened(values, signals), np.zeros_like(values), prior
     ) - prior.log_evidence_of_aligned(np.zeros(len(prior))) + norm().logpdf(values[:, timing])
     expected = logsumexp(exponent) + np.log(8 / 1200)
     best = values[np.argmax(exponent)]
     starts, alone = best + np.array([[-2.0], [0.0], [2.0]]) * prior.axes[0], []
     for start in starts:
         (found,), at, _ = log_ratios_of(
-            outside, likelihood, signals, signals.whitened, start[None], start[None], np.zeros(1),
+            outside, likelihood, signals, signals.whitened, start[None], start[None],
             np.array([expected]))
         assert found == pytest.approx(0, abs=0.05)
         np.testing.assert_allclose(at, best[None], atol=0.5 * prior.axes[0, timing])
@@ -140,8 +161,7 @@ def test_the_evidence_is_the_average_over_an_unknown_timing(random_beams):
     # Shots that take more steps do not affect others.
     together = select(signals, [0, 0, 0])
     found, _, _ = log_ratios_of(
-        outside, likelihood, together, together.whitened, starts, starts, np.zeros(3),
-        np.full(3, expected))
+        outside, likelihood, together, together.whitened, starts, starts, np.full(3, expected))
     np.testing.assert_allclose(found, alone, rtol=0, atol=1e-9)
 
 

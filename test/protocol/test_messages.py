@@ -127,7 +127,8 @@ def test_bands_are_indices(error_of, kind, field):
 def test_a_number_out_of_range_is_named(error_of, kind, field):
     declared = field.metadata['declared']
     for good in (declared.low, declared.high):
-        assert error_of(kind, **{field.name: field.type(good)}) == ''
+        # The value alone is in range; with others, a largest range of 0 is a contradiction.
+        assert declared.range not in error_of(kind, **{field.name: field.type(good)})
     for bad in (field.type(declared.low - 1), field.type(declared.high + 1)):
         assert error_of(kind, **{field.name: bad}) == (
             f'{field.name}: {bad}, expected {declared.range}')
@@ -174,6 +175,7 @@ MALFORMED = [
     (m.Posterior, {'means': np.zeros((3, 3))}, 'expected [COMPONENTS = 2, D = 3]'),
     (m.Posterior, {'covariances_m2': np.stack([np.eye(6)] * 2)},
      'expected [COMPONENTS = 2, D = 3, D = 3]'),
+    (m.Posterior, {'outside_range_m': 0.0}, 'outside_range_m: 0, expected the largest range'),
     (m.Posterior, {'surface_quaternion': np.zeros(4)}, 'a length other than 0'),
     (m.Posterior, {'surface_uncertainty': -np.eye(6)}, 'without negative eigenvalues'),
     *((m.Posterior, {f'{part}log_weights': np.zeros(n), f'{part}means': np.ones((n, 3)),
