@@ -14,7 +14,6 @@ import numpy as np
 
 from rhs_isac_ros.codebook.problem import Search
 from rhs_isac_ros.support.optional import optional_import
-from rhs_isac_ros.support.threads import one_blas_thread
 
 # Number of corrections that approximate the Hessian: more than SciPy's default of 10, because
 # evaluations are expensive.
@@ -57,8 +56,6 @@ def run_lbfgs(
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import minimize
 
-    # SciPy multiplies the corrections with a BLAS library of its own.
-    one_blas_thread.find_scipy()
     unit = 0.0
 
     def relative(variables: np.ndarray) -> tuple[float, np.ndarray]:
@@ -266,8 +263,6 @@ def minimize_interior_point(
     # A slow import, which loading a codebook does not need.
     from scipy.optimize import BFGS, Bounds, minimize
 
-    # SciPy multiplies the Hessian matrix with a BLAS library of its own.
-    one_blas_thread.find_scipy()
     best = search.value_and_gradient(start)[0], np.array(start)
     scale = best[0]
 

@@ -20,7 +20,6 @@ from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.los import los_gain
 from rhs_isac_ros.model.multipath import spatial_covariance
 from rhs_isac_ros.model.surface import NOMINAL, Response, on_levels, ports_of
-from rhs_isac_ros.support.threads import one_blas_thread
 
 # Numbers of steps and of exchanges.
 _N_STEPS, _N_EXCHANGES = 20, 40
@@ -35,7 +34,6 @@ def tuned_beam(scenario: Scenario, position: np.ndarray, band: int,
     """Find a beam that nearly maximises Eq. (10) for a user at a position, float64 [3] [m]."""
     from scipy.optimize import minimize
 
-    one_blas_thread.find_scipy()
     whole = TunedLink.to(scenario, position, band, surface)
     link = whole.at_subbands(representative_subbands(scenario, _MAX_DRIFT_RAD, _MAX_SUBBANDS))
     try:

@@ -21,6 +21,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Positioner, build_estimator
 from rhs_isac_ros.protocol.settings import PositionerSettings
 from rhs_isac_ros.ros import endpoints
+from rhs_isac_ros.ros.diagnostics import TABLE_PROGRESS
 from rhs_isac_ros.ros.parameters import calibrated_surface
 from rhs_isac_ros.ros.poses import LocatingNode
 from rhs_isac_ros.ros.run import entry
@@ -106,7 +107,7 @@ class PositionerNode(LocatingNode[Positioner]):
         if not self._table:
             return report
         return dataclasses.replace(
-            report, details={**report.details, 'table.progress': self._table})
+            report, details={**report.details, TABLE_PROGRESS: self._table})
 
     def execute(self, action: events.Action) -> None:
         """Build or prepare an estimator in the background, or process another action."""

@@ -13,6 +13,8 @@ from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.ros import endpoints, topics
 
 _PERIOD_S, _TOLERANCE_S = 1.0, 0.05
+# Name of the detail with the computed share of a table.
+TABLE_PROGRESS = 'table.progress'
 
 
 def to_ros(report: Report, name: str, stamp: Time) -> DiagnosticArray:

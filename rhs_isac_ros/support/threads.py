@@ -9,11 +9,13 @@ fifty times as long as with one. Public functions therefore run BLAS with one th
 import contextlib
 import ctypes
 import functools
+import importlib.util
 import itertools
 import os
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeAlias, TypeVar
 
@@ -58,7 +60,6 @@ class _OneBlasThread(contextlib.ContextDecorator):
         self._shared: list[_Library] = []
         self._per_thread: list[_Library] = []
         self._saved: list[tuple[_Library, int]] = []
-        self._has_scipy = False
         self.find_libraries()
 
     def __enter__(self) -> None:
@@ -100,26 +101,30 @@ class _OneBlasThread(contextlib.ContextDecorator):
         self._saved = []
 
     def find_libraries(self) -> None:
-        """Find the BLAS libraries that the process has loaded.
+        """Find the BLAS libraries that the process has loaded, and that of SciPy.
 
         The search holds the lock of the dynamic loader and needs the lock of the interpreter, so
         it would deadlock with a thread that is importing an extension module. It therefore runs
-        while this module is imported, and later only in `find_scipy`.
+        only while this module is imported.
         """
+        _load_blas_of_scipy()
         found = ThreadpoolController().select(user_api='blas').lib_controllers
-        per_thread = [library for library in found
-                      if getattr(library, 'threading_layer', '') == 'openmp']
-        with self._lock:
-            self._per_thread = per_thread
-            self._shared = [library for library in found if library not in per_thread]
-            if self._depth:
-                self._saved += _limit(self._shared)
+        self._per_thread = [library for library in found
+                            if getattr(library, 'threading_layer', '') == 'openmp']
+        self._shared = [library for library in found if library not in self._per_thread]
 
-    def find_scipy(self) -> None:
-        """Find SciPy's own BLAS, which the caller has loaded; a search takes milliseconds."""
-        if not self._has_scipy:
-            self.find_libraries()
-            self._has_scipy = True
+
+def _load_blas_of_scipy() -> None:
+    """Load the BLAS in SciPy's wheel, which takes milliseconds, but not SciPy itself.
+
+    Functions import SciPy when they first need it, also while other threads import modules.
+    """
+    spec = importlib.util.find_spec('scipy')
+    for folder in (spec.submodule_search_locations or ()) if spec else ():
+        for file in (*Path(folder).parent.glob('scipy.libs/*openblas*'),
+                     *Path(folder).glob('.dylibs/*openblas*')):
+            with contextlib.suppress(OSError):
+                ctypes.CDLL(str(file))
 
 
 def _limit(libraries: Iterable[_Library]) -> list[tuple[_Library, int]]:

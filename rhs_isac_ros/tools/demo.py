@@ -12,12 +12,14 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
 from rclpy.utilities import try_shutdown
 
 from rhs_isac_ros.calibration import load_surface
@@ -32,7 +34,8 @@ from rhs_isac_ros.positioning.site import Site
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.settings import PRIORS, REGION, TRACK
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
-from rhs_isac_ros.ros import endpoints, parameters
+from rhs_isac_ros.ros import endpoints, parameters, topics
+from rhs_isac_ros.ros.diagnostics import TABLE_PROGRESS
 from rhs_isac_ros.ros.environment import private_domain
 from rhs_isac_ros.ros.observer import CycleObserver
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
@@ -49,7 +52,7 @@ from rhs_isac_ros.system import add_files
 from rhs_isac_ros.tools.command import choose_scenario, entry
 from rhs_isac_ros.tools.pictures import compose_cycles
 
-# Maximum time between two complete cycles [s].
+# Maximum time between two complete cycles, or without progress of a node that computes [s].
 _CYCLE_TIMEOUT_S = 60.0
 # Time to wait for a step of a cycle if estimators find velocities, which takes most of a second
 # on an idle processor, and several seconds on a busy one.
@@ -120,15 +123,22 @@ def watch(
     """Spin an observer until it has received `cycles` complete cycles, or `stopped` is True.
 
     At first and whenever their number changes, `on_progress` is called with this number and with
-    `cycles`. Returns the error that ended the wait, or ''.
+    `cycles`. Returns the error that ended the wait, or ''. The wait continues while nodes compute
+    tables, which takes minutes for large surfaces.
     """
     seen, changed_s = -1, time.monotonic()
+    tables = _table_progress(observer)
+    before: dict[str, str] = {}
     # This executor takes messages in the order of their arrival, also when it is late.
     with EventsExecutor() as executor:
         executor.add_node(observer)
         while seen < cycles and not stopped():
             executor.spin_once(timeout_sec=_PERIOD_S)
             complete = len(observer.complete)
+            if tables != before:
+                for name in sorted(tables.keys() - before.keys()):
+                    print(f'{name} computes a table of templates', file=sys.stderr)
+                before, changed_s = dict(tables), time.monotonic()
             if complete != seen:
                 seen, changed_s = complete, time.monotonic()
                 on_progress(complete, cycles)
@@ -144,6 +154,18 @@ def watch(
                     f'no cycle within {_CYCLE_TIMEOUT_S:.0f} s; log of the base station, and '
                     'warnings of others:', processes.log(name), *warnings])
     return ''
+
+
+def _table_progress(node: Node) -> Mapping[str, str]:
+    """Return the latest progress of each node that computes a table, by name, as it changes."""
+    progress: dict[str, str] = {}
+
+    def receive(message: DiagnosticArray) -> None:
+        for status in message.status:
+            progress.update((status.name, pair.value) for pair in status.values
+                            if pair.key == TABLE_PROGRESS)
+    endpoints.subscribe(node, DiagnosticArray, topics.DIAGNOSTICS, receive, endpoints.EXCHANGE)
+    return progress
 
 
 def table(cycles: Sequence[CompleteCycle]) -> str:

@@ -183,5 +183,26 @@ def test_without_a_cycle_the_error_shows_the_warnings_of_all_nodes(monkeypatch):
     processes = types.SimpleNamespace(names=tuple(logs), ended=dict, log=logs.get)
     monkeypatch.setattr(demo, '_CYCLE_TIMEOUT_S', 0.0)
     monkeypatch.setattr(demo, 'EventsExecutor', mock.MagicMock())
+    monkeypatch.setattr(demo, '_table_progress', lambda _: {})
     error = demo.watch(types.SimpleNamespace(complete=[]), processes, 1, lambda *_: None)
     assert error.splitlines()[1:] == [logs['bs'], '[WARN] [positioner]: no estimator']
+
+
+def test_the_wait_continues_while_a_node_computes_a_table(monkeypatch, capsys):
+    """The table of 64 by 64 elements takes longer than the time between two cycles may be."""
+    clock = types.SimpleNamespace(now_s=0.0, monotonic=lambda: clock.now_s)
+    progress, executor = {}, mock.MagicMock()
+
+    def spin_once(timeout_sec):
+        clock.now_s += 40.0
+        if clock.now_s <= 400.0:
+            progress['positioner'] = f'{clock.now_s / 4:.0f} %'
+    executor().__enter__().spin_once = spin_once
+    for name, replacement in (('time', clock), ('EventsExecutor', executor),
+                              ('_table_progress', lambda _: progress)):
+        monkeypatch.setattr(demo, name, replacement)
+    processes = types.SimpleNamespace(names=('bs',), ended=dict, log=lambda _: '')
+    assert 'no cycle within 60 s' in demo.watch(
+        types.SimpleNamespace(complete=[]), processes, 1, lambda *_: None)
+    assert clock.now_s == 480.0
+    assert capsys.readouterr().err == 'positioner computes a table of templates\n'
