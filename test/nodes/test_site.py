@@ -137,13 +137,15 @@ class Running:
         return self.fused.until(checked, what, self.running.values())
 
     def until_fused(self, estimator, n=1):
-        """Wait for `n` more positions of the given surfaces, and return them."""
+        """Wait for positions of the given surfaces in `n` more cycles, and return them."""
         before = len(self.fused.received[m.PositionEstimate])
 
         def found():
-            new = [one for one in self.fused.received[m.PositionEstimate][before:]
-                   if one.estimator == estimator]
-            return new if len(new) >= n else None
+            # The base station of a busy machine asks again, and gets the same answer.
+            new = {(one.cycle_id, one.user): one
+                   for one in self.fused.received[m.PositionEstimate][before:]
+                   if one.estimator == estimator}
+            return [*new.values()] if len(new) >= n else None
         return self.until(found, estimator)
 
     @contextlib.contextmanager
