@@ -54,9 +54,9 @@ from rhs_isac_ros.tools.pictures import compose_cycles
 
 # Maximum time between two complete cycles, or without progress of a node that computes [s].
 _CYCLE_TIMEOUT_S = 60.0
-# Time to wait for a step of a cycle if estimators find velocities, which takes most of a second
-# on an idle processor, and several seconds on a busy one.
-_MOVING_TIMEOUT_S = 20.0
+# Steps of a cycle are repeated as often as by default, but for longer. On a busy processor, a
+# position with a velocity takes several seconds, and so do the signals of a large surface.
+_STEPS: dict[str, Any] = {'step_timeout_s': 20.0, 'retries': 79}
 # Speed of users whom codebooks follow; faster ones move too far between two cycles.
 _WALKING_MPS = 1.0
 # Period of checks [s].
@@ -360,14 +360,13 @@ class _Demonstration:
         start_network(
             processes, options.users, self.scenario, together=together,
             surfaces=self.site.surfaces if self.site else (),
-            first_cycle=1, seed=options.seed, **self.files,
+            first_cycle=1, seed=options.seed, **_STEPS, **self.files,
             prior=options.prior, library_file=options.follow, calibration_file=options.calibration,
             states_file=options.calibration, surface=options.surface,
             surface_options=f'port={shlex.quote(port)}' if port else None,
             # Other radios have noise of their own.
             radio=options.radio, radio_options=options.radio_options,
             samples_folder=options.samples, receiver_noise=options.radio == 'emulated',
-            step_timeout_s=_MOVING_TIMEOUT_S if self.scenario.user_speed_std_mps else None,
             speed_mps=_WALKING_MPS if options.follow else None,
             # The parameter does not admit 0.
             track_speed_mps=None if options.prior == REGION else _WALKING_MPS if options.follow
