@@ -75,7 +75,7 @@ CALLS = [
     ('tools.calibrate', ['garbage', '--cycles', '9'], 'expected for a running network'),
     ('tools.calibrate', ['garbage', '--output', 'garbage'], 'a file other than'),
     ('tools.replay', ['none.mcap'], "'none.mcap', expected an existing file"),
-    ('tools.replay', ['folder'], 'folder: a directory'),
+    ('tools.replay', ['folder'], 'folder: expected a file, or a folder with'),
     pytest.param('tools.replay', ['garbage'], 'garbage: not a complete recording',
                  marks=NEEDS_MCAP),
     ('tools.replay', ['garbage', '--estimator', 'magic'], "estimator: 'magic', expected one of"),

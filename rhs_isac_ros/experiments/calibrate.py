@@ -26,7 +26,7 @@ from rhs_isac_ros.codebook import Codebook, default_codebook_file
 from rhs_isac_ros.experiments.pilots import Found, PilotWork
 from rhs_isac_ros.model import MultipathEstimate, Scenario
 from rhs_isac_ros.model.boards import board_of
-from rhs_isac_ros.support.arguments import check_distinct, input_file, output_file, typed
+from rhs_isac_ros.support.arguments import check_distinct, input_path, output_file, typed
 from rhs_isac_ros.support.exits import exit_code_of
 from rhs_isac_ros.support.files import (
     ArchiveError,
@@ -193,7 +193,7 @@ def given(options: argparse.Namespace, names: Sequence[str]) -> str:
 def add_options(parser: argparse.ArgumentParser, sources: str = '') -> None:
     """Add the options of the command; `sources` describes further sources of pilots."""
     add = parser.add_argument
-    add('file', type=input_file, nargs='?',
+    add('file', type=input_path, nargs='?',
         help=f'{sources}{ARRAYS} file with the arrays positions [N, 3] (m) and received '
         '[N, N_B, N_SB F], by default received with the default codebook')
     what = parser.add_mutually_exclusive_group()

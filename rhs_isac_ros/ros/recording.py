@@ -218,10 +218,11 @@ def read(
 ) -> Iterator[tuple[str, bytes, float]]:
     """Yield the topic, the bytes (CDR) and the recorded time [s] of each message of a known type.
 
-    The messages are sorted by time; copies of a recording may have them in another order. The
-    known types are those of `recorded_topics`. `names`, if given, selects topics by full name.
-    Fields that the installed type has after those of the recorded one have their defaults. Raises
-    RecordingError if the file cannot be read, or a type differs otherwise.
+    The path is that of a file, or of a folder that ``ros2 bag record`` has written. The messages
+    are sorted by time; copies of a recording may have them in another order. The known types are
+    those of `recorded_topics`. `names`, if given, selects topics by full name. Fields that the
+    installed type has after those of the recorded one have their defaults. Raises RecordingError
+    if a file cannot be read, or a type differs otherwise.
     """
     kinds = {type_name(kind): kind for kind, _ in recorded_topics().values()}
     known: dict[tuple[str, int], Any] = {}
@@ -229,6 +230,9 @@ def read(
     messages: list[tuple[str, bytes, int]] = []
     for record in _records(path):
         what = type(record).__name__
+        if what == 'Header':
+            # Each file has its own numbers.
+            known, converted = {}, {}
         if what in ('Schema', 'Channel'):
             known[what, record.id] = record
         if what != 'Message':
@@ -337,6 +341,20 @@ def _parsed(path: str | Path, record: Any) -> Any:
 
 
 def _records(path: str | Path) -> Iterator[Any]:
+    """Yield the records of a file, or of the files of a folder of ``ros2 bag record``."""
+    folder = Path(path)
+    files = [folder]
+    if folder.is_dir():
+        # Without metadata, files may be of different recordings.
+        files = sorted(folder.glob('*.mcap')) if (folder / 'metadata.yaml').exists() else []
+    if not files:
+        raise RecordingError(f'{path}: expected a file, or a folder with metadata.yaml and files '
+                             '*.mcap, which ros2 bag record -s mcap writes')
+    for file in files:
+        yield from _records_of(file)
+
+
+def _records_of(path: Path) -> Iterator[Any]:
     """Yield the records of a file and of its chunks, in the order of the file.
 
     Unlike the readers of mcap, this function limits the size of a decompressed chunk. If the end
@@ -349,7 +367,7 @@ def _records(path: str | Path) -> Iterator[Any]:
         from mcap.stream_reader import StreamReader, breakup_chunk
     is_begun = False
     try:
-        stream = Path(path).open('rb')
+        stream = path.open('rb')
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
     with stream:

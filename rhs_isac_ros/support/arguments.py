@@ -96,12 +96,18 @@ def interval(text: str) -> tuple[float, float]:
 
 def input_file(text: str) -> Path:
     """Parse the path of a file that can be read, or raise argparse.ArgumentTypeError."""
+    path = input_path(text)
+    if path.is_dir():
+        raise argparse.ArgumentTypeError(f'{text}: a directory, expected a file')
+    return path
+
+
+def input_path(text: str) -> Path:
+    """Parse the path of a file or folder that can be read; raise as `input_file`."""
     path = Path(text)
     # The file is not opened, because the content of a pipe can be read only once.
     if not text or not os.path.exists(path):
         raise argparse.ArgumentTypeError(f'{text!r}, expected an existing file')
-    if path.is_dir():
-        raise argparse.ArgumentTypeError(f'{text}: a directory, expected a file')
     if not os.access(path, os.R_OK):
         raise argparse.ArgumentTypeError(f'{text}: expected a file that can be read')
     return path

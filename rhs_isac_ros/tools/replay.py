@@ -34,7 +34,13 @@ from rhs_isac_ros.positioning.store import default_folder
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.positioner import Tracks
 from rhs_isac_ros.ros.recording import Recorded, RecordingError, read_networks
-from rhs_isac_ros.support.arguments import ArgumentParser, input_file, positive_float, typed
+from rhs_isac_ros.support.arguments import (
+    ArgumentParser,
+    input_file,
+    input_path,
+    positive_float,
+    typed,
+)
 from rhs_isac_ros.support.texts import text_table
 from rhs_isac_ros.system import System, add_files
 from rhs_isac_ros.tools import command, republish
@@ -285,7 +291,7 @@ def _parser() -> argparse.ArgumentParser:
         prog='replay', description='Feed the received signals of a recording to estimators, and '
         'compare their errors with the errors of the recorded network.')
     add = parser.add_argument
-    add('file', type=input_file, help='recording')
+    add('file', type=input_path, help='recording, or folder of ros2 bag record')
     add('--estimator', action='append', type=typed(EstimatorKind), metavar='NAME',
         help=f'{", ".join(ESTIMATORS)}, an installed plug-in or MODULE:NAME; may be repeated '
              '(default: bayes)')

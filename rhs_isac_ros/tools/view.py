@@ -26,7 +26,7 @@ from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.ros.recording import RecordingError
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
-    input_file,
+    input_path,
     integer,
     output_file,
     positive_int,
@@ -216,7 +216,8 @@ def _parser() -> argparse.ArgumentParser:
         prog=_PROGRAM, description='Show a running network, or a recording, in three dimensions '
         'and in charts over the cycles: in the browser until Ctrl-C, or as a file for Rerun.')
     add = parser.add_argument
-    add('file', nargs='?', type=input_file, help='recording; by default the running network')
+    add('file', nargs='?', type=input_path,
+        help='recording, or folder of ros2 bag record; by default the running network')
     add('--save', type=output_file, metavar='FILE',
         help='write a file for Rerun, *.rrd, instead of serving the viewer')
     add('--cycles', type=positive_int, default=0, metavar='N',

@@ -130,6 +130,27 @@ def test_messages_are_read_in_the_order_of_their_arrival(tmp_path):
         (b'\1', 1.0), (b'\1', 1.0), (b'\2', 2.0), (b'\3', 3.0)]
 
 
+def test_a_folder_of_ros2_bag_is_one_recording(tmp_path):
+    """With a limit of size, it contains several files, which number topics and types anew."""
+    from mcap.writer import Writer
+    kinds = {'/ack': 'rhs_isac_msgs/msg/Ack', '/beacon': 'rhs_isac_msgs/msg/Beacon'}
+    for number, names in enumerate((['/ack', '/beacon'], ['/beacon', '/ack'])):
+        writer = Writer(str(tmp_path / f'lab_{number}.mcap'))
+        writer.start()
+        for name in names:
+            channel = writer.register_channel(
+                name, 'cdr', writer.register_schema(kinds[name], '', b''))
+            writer.add_message(channel, 10**9 * (2 - number), name.encode(), 0)
+        writer.finish()
+    for act in (lambda: list(read(tmp_path)), lambda: read_networks(tmp_path)):
+        with pytest.raises(RecordingError, match='or a folder with metadata.yaml'):
+            act()
+    (tmp_path / 'metadata.yaml').touch()
+    assert [(name, time_s) for name, content, time_s in read(tmp_path)
+            if name.encode() == content] == [
+        ('/beacon', 1.0), ('/ack', 1.0), ('/ack', 2.0), ('/beacon', 2.0)]
+
+
 def test_a_recorder_replaces_no_file(tmp_path):
     path = tmp_path / 'run.mcap'
     recorder = Recorder(path, Scenario())
