@@ -274,12 +274,15 @@ def read_matlab(path: str | Path, names: set[str]) -> dict[str, np.ndarray]:
         found = reader(path, names)
         for name, array in found.items():
             if array.dtype.kind not in 'biufc':
-                raise ValueError(f'{name}: {array.dtype}, expected numbers')
+                raise ArchiveError(f'{name}: {array.dtype}, expected numbers')
     except MissingLibraryError:
         raise
-    # The readers raise many kinds of errors for damaged files.
+    except ArchiveError as error:
+        raise ArchiveError(f'{path}: cannot be read: {error}') from error
+    # The readers raise many kinds of errors for damaged files, and for other formats of Octave.
     except Exception as error:
-        raise ArchiveError(f'{path}: cannot be read: {_reason(error)}') from error
+        raise ArchiveError(f'{path}: cannot be read: {_reason(error)}; expected arrays that '
+                           'MATLAB, or Octave with save -v7, has written') from error
     return found
 
 
@@ -288,7 +291,7 @@ def _read_matlab5(path: str | Path, names: set[str]) -> dict[str, np.ndarray]:
 
     shapes = [shape for name, shape, _ in whosmat(path) if name in names]
     if sum(16 * math.prod(shape) for shape in shapes) > _MAX_BYTES:
-        raise ValueError('more than 256 MiB of arrays')
+        raise ArchiveError('more than 256 MiB of arrays')
     found = loadmat(path, variable_names=names)
     return {name: found[name] for name in names & {*found}}
 
@@ -301,9 +304,9 @@ def _read_hdf5(path: str | Path, names: set[str]) -> dict[str, np.ndarray]:
         sets = {name: file[name] for name in names & {*file}}
         for name, one in sets.items():
             if not isinstance(one, h5py.Dataset):
-                raise ValueError(f'{name}: a structure or a sparse matrix, expected numbers')
+                raise ArchiveError(f'{name}: a structure or a sparse matrix, expected numbers')
         if sum(16 * one.size for one in sets.values()) > _MAX_BYTES:
-            raise ValueError('more than 256 MiB of arrays')
+            raise ArchiveError('more than 256 MiB of arrays')
         # The axes are reversed. An empty array is stored as its shape.
         return {name: np.empty(one[()].astype(int)) if one.attrs.get('MATLAB_empty')
                 else _complex(one[()]).T for name, one in sets.items()}
