@@ -148,9 +148,11 @@ class TemplateTable:
             step, value = self._step(query, peaks, points, values)
             points = points + step
         curvature = self.cells.curvature.take(peaks.cell, axis=0)
-        # Moving a point into the region lowers its likelihood.
-        inside = move_inside(points, curvature, self._resolution.bounds_m)
-        value = value - likelihood_loss(inside - points, curvature)
+        # Moving a point into the region lowers its likelihood; the parameters follow.
+        marginal = self.cells.marginal.take(peaks.cell, axis=0)
+        inside = move_inside(points, marginal, self._resolution.bounds_m)
+        value = value - likelihood_loss(inside - points, marginal)
+        values += np.einsum('pqa,pa->pq', self.cells.regression[peaks.cell], inside - points)
         order = np.lexsort((-value, peaks.shots))
         of_shot = Segments.of_keys(peaks.shots[order])
         error = _LIMITS.step_error * self.cells.loss[peaks.cell[order]]

@@ -101,15 +101,14 @@ class PeakFinder:
                      value, gain, candidates.outputs.T.astype(complex))
 
     def _maxima(self, candidates: Candidates, query: Query) -> Peaks:
-        """Return the local maxima along the range, but not those at the ends of a window."""
+        """Return the local maxima along the range; see `_inner_maxima`."""
         if query.prior.phase_covariance.any():
             along = 2 * query.prior.amplitude(
                 self._turns[..., None] * candidates.outputs[:, None])
         else:
             outputs = candidates.outputs
             along = self._rotation @ np.concatenate([outputs.real, outputs.imag])
-        step, window = _inner_maxima(
-            along, candidates.energy, Segments.of_keys(candidates.shots))
+        step, window = _inner_maxima(along)
         # The vertex of a parabola through a maximum and the steps beside it.
         before, highest, after = (
             along.take((step + side) * along.shape[1] + window) for side in (-1, 0, 1))
@@ -135,20 +134,16 @@ class PeakFinder:
         return Peaks(found.shots, found.cell, centre_m, found.range_m, value, gain, outputs)
 
 
-def _inner_maxima(along: np.ndarray, energy: np.ndarray, of_shot: Segments
-                  ) -> tuple[np.ndarray, np.ndarray]:
+def _inner_maxima(along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return step and window of the local maxima of values [S, W], by window, int [P] each.
 
-    The values of a shot have no maximum if the wavelength is far longer than the region. Its
-    highest value between the ends of a window is then returned.
+    A window without a maximum, as at an end of the region, has its highest value between its ends.
     """
     inner = along[1:-1]
     is_peak = inner >= along[:-2]
     is_peak &= inner > along[2:]
-    lacking = ~of_shot.max(np.logical_or.reduce(is_peak))
-    for rows in select(of_shot, lacking).slices:
-        values = inner[:, rows] - energy[rows]
-        is_peak[:, rows][np.unravel_index(values.argmax(), values.shape)] = True
+    (lacking,) = np.nonzero(~np.logical_or.reduce(is_peak))
+    is_peak[inner[:, lacking].argmax(axis=0), lacking] = True
     step, window = marked(is_peak)
     order = np.argsort(window, kind='stable')
     return step[order] + 1, window[order]

@@ -20,7 +20,7 @@ from rhs_isac_ros.system import System
 _MAX_FILES = 32
 _PREFIX = 'table-'
 # Version of the contents; tables of other versions are ignored.
-_FORMAT = 9
+_FORMAT = 10
 
 
 def default_folder() -> Path | None:

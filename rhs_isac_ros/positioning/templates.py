@@ -13,7 +13,7 @@ import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import adjoint, multiply_rows, read_only
-from rhs_isac_ros.model.gaussian import quadratic_form
+from rhs_isac_ros.model.gaussian import marginalise, quadratic_form
 from rhs_isac_ros.model.geometry import to_positions, velocity_std_mps
 from rhs_isac_ros.positioning.lattice import (
     PHASE_ERROR,
@@ -44,6 +44,8 @@ class _Limits(NamedTuple):
     energy: float = 1 / PHASE_ERROR**2
     # Error within a range bin, as a share of the energy of the template.
     error: float = 0.015
+    # Smallest information about a parameter.
+    least: float = 1e-9
 
 
 _LIMITS = _Limits()
@@ -58,17 +60,18 @@ def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None =
     respect to (r [m], u, v), complex64 [N_B, N_SB, G, 3, F]; ``energy`` of the whitened means,
     float32 [C]; ``energy_slope``, its derivative, float32 [C, 3]; ``template_energy`` and
     ``error``, energies of the whitened templates and of their differences from the means,
-    float32 [C]; ``curvature`` of the log-likelihood, float64 [C, 3, 3]; ``spread``, the mean
-    of the outer products of the whitened means, ``limiter``, which multiplies whitened
-    signals, and ``whitener``, which whitens and limits signals, complex128 [N_B, N_SB F, N_SB
-    F]; and ``normal``, points that represent a standard Gaussian, float64 [128, 3]. Energies
-    and derivatives are those of limited means.
+    float32 [C]; ``curvature`` of the log-likelihood, float64 [C, 3, 3]; ``marginal``, the
+    curvature with the Q nuisance parameters that fit best, float64 [C, 3, 3], and ``regression``,
+    the derivatives of these, float64 [C, Q, 3]; ``spread``, the mean of the outer products of the
+    whitened means, ``limiter``, which multiplies whitened signals, and ``whitener``, which whitens
+    and limits signals, complex128 [N_B, N_SB F, N_SB F]; and ``normal``, points that represent a
+    standard Gaussian, float64 [128, 3]. Energies and derivatives are those of limited means.
     """
     part, grid = grid, grid or lay_grid(model.scenario)
     points, (n_bands, n_rows) = grid.points, model.shape
     n_subbands = model.scenario.n_subbands
     n_frames, n_cells = n_rows // n_subbands, len(grid.node)
-    shape = n_bands, n_subbands, len(grid.nodes)
+    shape, prior = (n_bands, n_subbands, len(grid.nodes)), NuisancePrior(model)
     table: dict[str, np.ndarray] = {
         'filters': np.empty((*shape, n_frames), np.complex64),
         'slope_filters': np.empty((*shape, 3, n_frames), np.complex64),
@@ -77,6 +80,8 @@ def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None =
         'template_energy': np.empty(n_cells, np.float32),
         'error': np.empty(n_cells, np.float32),
         'curvature': np.empty((n_cells, 3, 3)),
+        'marginal': np.empty((n_cells, 3, 3)),
+        'regression': np.empty((n_cells, len(prior), 3)),
         'normal': standard_normal(N_NORMAL),
     }
     positions, std = _positions_in(model.scenario, part), velocity_std_mps(model.scenario)
@@ -98,7 +103,7 @@ def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None =
         first, n = of_node.starts[start], of_node.counts[nodes].sum()
         for cells in np.array_split(by_node[first:first + n], -(-n // _LIMITS.block)):
             of_cells = _of_cells(
-                expansion, table['whitener'], grid.node[cells] - start, points[cells])
+                expansion, table['whitener'], grid.node[cells] - start, points[cells], prior)
             for name, values in of_cells.items():
                 table[name][cells] = values
 
@@ -106,19 +111,26 @@ def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None =
     return table
 
 
-def _of_cells(expansion: Expansion, whitener: np.ndarray, index: np.ndarray, points: np.ndarray
-              ) -> dict[str, np.ndarray]:
+def _of_cells(expansion: Expansion, whitener: np.ndarray, index: np.ndarray, points: np.ndarray,
+              prior: NuisancePrior) -> dict[str, np.ndarray]:
     """Compute arrays of `tabulate` for cells with the templates `index` [M] and centres [M, 3]."""
-    white = whiten(whitener, *expansion.at(index, points))
+    mean, slopes = expansion.at(index, points)
+    white = whiten(whitener, mean, np.concatenate(
+        [slopes, prior.scaled_patterns * mean[:, None]], axis=1))
     template = whiten(whitener, expansion.template_at(index, points[:, 0]))
     # Products of the means, in the first row and column, and of their derivatives.
-    form = quadratic_form(white.reshape(len(points), 4, -1))
+    form = quadratic_form(white.reshape(len(points), 4 + len(prior), -1))
+    information = form[:, 1:, 1:].copy()
+    information[:, 3:, 3:] += prior.information + np.diag(prior.precision + _LIMITS.least)
+    marginal = marginalise(information, np.zeros(information.shape[:2]))
     return {
         'template_energy': np.sum(np.abs(template)**2, axis=(1, 2, 3)),
         'error': np.sum(np.abs(template - white[:, :1])**2, axis=(1, 2, 3)),
         'energy': form[:, 0, 0] / 2,
-        'energy_slope': form[:, 0, 1:],
-        'curvature': form[:, 1:, 1:],
+        'energy_slope': form[:, 0, 1:4],
+        'curvature': form[:, 1:4, 1:4],
+        'marginal': marginal.information,
+        'regression': marginal.regression,
     }
 
 
@@ -212,6 +224,10 @@ class Cells(NamedTuple):
     along: np.ndarray
     curvature: np.ndarray  # Float64 [C, 3, 3].
     inverse: np.ndarray  # Inverse of `curvature`, float32 [C, 3, 3].
+    # Curvature with the parameters that fit best, float64 [C, 3, 3], and their derivatives,
+    # [C, Q, 3].
+    marginal: np.ndarray
+    regression: np.ndarray
     # Largest loss of log-likelihood because the direction lies between those of the grid, or the
     # curvature of the wavefront differs, float64 [C].
     loss: np.ndarray
@@ -221,14 +237,16 @@ class Cells(NamedTuple):
         """Take the energies and curvatures from the result of `tabulate`."""
         range_m, energy = grid.ranges_m[grid.range_bin], arrays['energy']
         slope = arrays['energy_slope']
-        curvature = arrays['curvature'] + np.diag(resolution.curvature_floor)
+        floor = np.diag(resolution.curvature_floor)
+        curvature = arrays['curvature'] + floor
         half = PHASE_ERROR * resolution.direction
         across = np.abs(arrays['curvature'][:, 1:, 1:])
         loss = np.einsum('a,cab,b->c', half, across, half) / 2 + (
             arrays['error'] + _LIMITS.error * energy)
         return cls(
             range_m, arrays['template_energy'], energy, slope, slope[:, 0] + 2 * energy / range_m,
-            curvature, np.linalg.inv(curvature).astype(np.float32), loss)
+            curvature, np.linalg.inv(curvature).astype(np.float32), arrays['marginal'] + floor,
+            arrays['regression'], loss)
 
     def template_energy_at(self, cells: np.ndarray, range_m: np.ndarray) -> np.ndarray:
         """Return the energies of templates [K] at ranges in their cells, float32 [K]."""

@@ -236,3 +236,25 @@ def test_a_step_predicts_the_likelihood_after_it(codebook):
     first, *_, last = (float(modes.log_likelihood[0]) for modes in found)
     assert first == pytest.approx(last, abs=0.5)
     np.testing.assert_allclose(found[3].points, found[2].points, atol=1e-4)
+
+
+@pytest.mark.parametrize('size_m', [(0, 0, 3), (0, 4, 0)], ids=['upright', 'across'])
+@pytest.mark.parametrize('changes', [
+    {'band_phase_std_rad': np.inf}, {'timing_std_s': np.inf, 'phase_std_rad': np.inf}], ids=str)
+def test_users_on_a_line_have_the_modes_near_them(codebook, changes, size_m):
+    """The search begins off the line, where unknown phases fit another range."""
+    scenario = dataclasses.replace(
+        SCENARIO, roi_center_m=(6, 0.7, 0.4), roi_size_m=size_m, multipath_to_los_db=-20.0,
+        **changes)
+    rng, likelihood = np.random.default_rng(2), Likelihood(System(scenario, codebook))
+    grid = TemplateTable(scenario, tabulate(likelihood.model))
+    positions = scenario.sample_positions(40, rng)
+    signals = likelihood.signals(MeasurementModel(scenario, codebook).sample(positions, rng))
+    aligned = Alignment(likelihood, grid.spread).values_of_each(signals.received)
+    points, values = to_polar(positions), aligned
+    for _ in range(3):
+        _, values, _ = marginal_at(likelihood, likelihood, points, values, signals)
+    near = ascend(likelihood, likelihood, Starts(np.arange(40), points, values), signals, 8)
+    best = [one.log_likelihood[0] for one in of_each(find_modes(
+        likelihood, grid, signals, aligned))]
+    assert np.min(best - near.log_likelihood) > -0.5
