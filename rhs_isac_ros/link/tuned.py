@@ -11,10 +11,10 @@ import dataclasses
 
 import numpy as np
 
-from rhs_isac_ros.link.band_link import Link, representative_subbands
+from rhs_isac_ros.link.band_link import Link, representative_subbands, water_filling
 from rhs_isac_ros.link.capacity import Beamformer
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.arrays import checked_position
+from rhs_isac_ros.model.arrays import adjoint, checked_position
 from rhs_isac_ros.model.board import Board, BoardError, Ports
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.model.los import los_gain
@@ -101,6 +101,34 @@ class TunedLink(Link):
             np.conj(slope) * by_radiation[:, :, None])
         return float(np.log1p(snr).sum()), gradient[0, 0]
 
+    def rates_after_changes(self, tunings: np.ndarray, levels: np.ndarray) -> np.ndarray:
+        """Return the capacities after one element has another of L levels, float64 [N_E, L].
+
+        A change d of a coefficient adds d u to the column of its element, of propagation u, and
+        terms of the first and the second order in d to the correlation matrix at the feeds.
+        Raises BoardError if elements are coupled.
+        """
+        slope, offset, gain = self.response
+        columns = np.moveaxis(gain * self.board.paths(self.ports)[0], 2, 1)[..., None]
+        every = np.repeat(levels[None, :, None], len(tunings), axis=2)
+        before, after = (slope * self.board.coefficients(self.ports, one)[0] + offset
+                         for one in (tunings[None, None], every))
+        configured, scattered, direct = (one[0, 0] for one in self.feeds(tunings))
+        matrix = direct * adjoint(direct) + np.matmul(scattered, adjoint(configured))
+        los = self.los[0, :, :, None, None]
+        first = columns * adjoint(np.swapaxes(scattered, 1, 2)[..., None] + (
+            np.conj(los) * direct[:, None]))
+        second = columns * adjoint(columns) * (
+            self.spatial.power[0, :, None, None] + np.abs(los)**2)
+        # Axes: sub-band, level, element, feed, feed.
+        change = (after - before)[..., None, None]
+        linear = change * first[:, None]
+        gains = np.linalg.eigvalsh(
+            matrix[:, None, None] + linear + adjoint(linear)
+            + np.abs(change)**2 * second[:, None])
+        snr = np.moveaxis(np.maximum(gains[..., -1], 0), 0, 2) / self.noise_power_w
+        return np.log1p(snr * water_filling(snr, self.power_w)).sum(axis=2).T
+
     def exchanged(self, tunings: np.ndarray, n_levels: int) -> np.ndarray:
         """Return tunings after exchanges for other levels, until no single one is better.
 
@@ -108,12 +136,16 @@ class TunedLink(Link):
         """
         if not n_levels:
             return tunings
-        rate, n = self.best_rate(tunings)[0, 0], len(tunings)
-        levels, counts = np.linspace(0, 1, n_levels), 2**np.arange(n.bit_length())
+        rate = self.best_rate(tunings)[0, 0]
+        levels, counts = np.linspace(0, 1, n_levels), 2**np.arange(len(tunings).bit_length())
         for _ in range(_N_EXCHANGES):
-            others = np.repeat(tunings[None], n * n_levels, axis=0)
-            others[np.arange(len(others)), np.repeat(np.arange(n), n_levels)] = np.tile(levels, n)
-            rates = self.best_rate(others).reshape(n, n_levels)
+            try:
+                rates = self.rates_after_changes(tunings, levels)
+            except BoardError:
+                # With coupling, an element changes the signals of all others.
+                others = np.tile(tunings, (len(tunings), n_levels, 1))
+                others[np.arange(len(tunings)), :, np.arange(len(tunings))] = levels
+                rates = self.best_rate(others.reshape(-1, len(tunings))).reshape(-1, n_levels)
             order = np.argsort(-rates.max(axis=1))
             is_exchanged = np.argsort(order) < counts[:, None]
             together = np.where(is_exchanged, levels[rates.argmax(axis=1)], tunings)

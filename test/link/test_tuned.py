@@ -43,6 +43,21 @@ def test_the_gradient_is_a_limit_of_differences_also_with_a_known_surface():
     assert (high - low) / 2 == pytest.approx(gradient @ step, rel=1e-5)
 
 
+@pytest.mark.parametrize(('board', 'levels'), BOARDS)
+def test_the_capacities_after_changes_of_single_tunings_are_those_of_their_tunings(board, levels):
+    scenario = Scenario(elements_per_side=3, board=board, amplitude_levels=levels)
+    rng, steps = np.random.default_rng(0), np.linspace(0, 1, levels or 3)
+    surface = SurfaceEstimate(
+        1 + 0.1 * rng.normal(size=(9, 2)) @ [1, 1j], 0.1j * np.ones(9), [1.1, 0.9j],
+        np.zeros((20, 0)), np.zeros(9))
+    link, tunings = TunedLink.to(scenario, POSITION, 1, surface), rng.choice(steps, 9)
+    changed = np.tile(tunings, (9, len(steps), 1))
+    changed[np.arange(9), :, np.arange(9)] = steps
+    rates = link.rates_after_changes(tunings, steps)
+    for one, rate in zip(changed, rates, strict=True):
+        np.testing.assert_allclose(rate, link.best_rate(one)[0], rtol=1e-12)
+
+
 def test_boards_with_more_freedom_reach_more_capacity():
     def reached(board, levels=0):
         scenario = Scenario(elements_per_side=6, board=board, amplitude_levels=levels)
