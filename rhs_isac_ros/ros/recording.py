@@ -41,8 +41,10 @@ _SEPARATOR = '=' * 80
 # Metadata: scenarios by the name of the surface, empty for the namespace of the recorder; and the
 # bounds of the region of a site.
 _SCENARIO, _NETWORK, _WHOLE, _REGION = 'scenario', 'network', '', 'region'
-# Maximum size of a record, and of a decompressed chunk [bytes].
+# Maximum size of a record, and of a decompressed chunk or message [bytes].
 _MAX_BYTES = 2**26
+# Begin of a message that ``ros2 bag record --compression-mode message`` has compressed with zstd.
+_ZSTD = b'\x28\xb5\x2f\xfd'
 # Period of completing a chunk, so that a killed process loses at most this time [s].
 _FLUSH_S = 0.5
 # Maximum number of characters of a scenario.
@@ -245,7 +247,11 @@ def read(
             continue
         if found.id not in converted:
             converted[found.id] = _conversion(path, found, kinds[found.name])
-        messages.append((channel.topic, converted[found.id](record.data), record.log_time))
+        content = record.data
+        if content.startswith(_ZSTD):
+            with translated(Exception, RecordingError, f'{path}: {channel.topic}'):
+                content = _expanded(content, _MAX_BYTES)
+        messages.append((channel.topic, converted[found.id](content), record.log_time))
     messages.sort(key=lambda message: message[2])
     yield from ((topic, content, 1e-9 * time_ns) for topic, content, time_ns in messages)
 
@@ -349,7 +355,8 @@ def _records(path: str | Path) -> Iterator[Any]:
         files = sorted(folder.glob('*.mcap')) if (folder / 'metadata.yaml').exists() else []
     if not files:
         raise RecordingError(f'{path}: expected a file, or a folder with metadata.yaml and files '
-                             '*.mcap, which ros2 bag record -s mcap writes')
+                             '*.mcap, which ros2 bag record -s mcap writes, not those of '
+                             '--compression-mode file')
     for file in files:
         yield from _records_of(file)
 
@@ -393,16 +400,22 @@ def _records_of(path: Path) -> Iterator[Any]:
 def _decompressed(chunk: Any) -> Any:
     """Return a chunk without compression; raise ValueError if it is too large."""
     import lz4.frame
-    import zstandard
 
     size = chunk.uncompressed_size
     if size > _MAX_BYTES:
         raise ValueError(f'a chunk of {size} bytes, expected at most {_MAX_BYTES}')
     match chunk.compression:
         case 'zstd':
-            data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size)
+            data = _expanded(chunk.data, size)
         case 'lz4':
             data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size)
         case _:
             data = chunk.data
     return dataclasses.replace(chunk, compression='', data=data)
+
+
+def _expanded(data: bytes, size: int) -> bytes:
+    """Return up to `size` bytes of data that zstd has compressed."""
+    import zstandard
+
+    return bytes(zstandard.ZstdDecompressor().stream_reader(data).read(size))
