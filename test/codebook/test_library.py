@@ -138,7 +138,7 @@ def test_the_pitch_is_the_largest_with_a_small_loss(start, monkeypatch):
 
     monkeypatch.setattr(library, 'optimised', optimised)
     monkeypatch.setattr(library, 'compared', compared)
-    wide = dataclasses.replace(SCENARIO, roi_size_m=(4.0, 4.0, 4.0), roi_center_m=(4, 0, 0))
+    wide = dataclasses.replace(SCENARIO, roi_size_m=(4.0, 4.0, 1.0), roi_center_m=(4, 0, 0))
     found = library.make_library(
         wide, start, 'error', (0.1,), 0.05, lambda *report: reports.append(report))
     found.check(wide)
