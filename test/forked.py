@@ -25,11 +25,11 @@ FORKS.set_forkserver_preload([
         if package == 'nodes')])
 
 
-def run_executable(command, log, environment):
+def run_executable(command, log, environment, attributes):
     """Run an executable in this process, a new fork, as its command would, and exit.
 
-    Output is appended to `log`. A signal results in the exit code 0, even before the executable
-    handles it.
+    Output is appended to `log`. The module of the executable gets `attributes`. A signal results
+    in the exit code 0, even before the executable handles it.
     """
     # Collections then leave the memory alone that the process shares with its parent.
     gc.freeze()
@@ -45,6 +45,7 @@ def run_executable(command, log, environment):
     Path('/proc/self/comm').write_text(name, encoding='ascii')
     sys.argv = list(command)
     module = importlib.import_module(f'rhs_isac_ros.nodes.{name}')
+    vars(module).update(attributes)
     sys.exit(exit_code_of(module.main, program=name))
 
 
@@ -54,9 +55,10 @@ class Forked:
     It has the interface of `subprocess.Popen`.
     """
 
-    def __init__(self, command, log, environment):
+    def __init__(self, command, log, environment, attributes=None):
         self._command = command
-        self._process = FORKS.Process(target=run_executable, args=(command, log, environment))
+        self._process = FORKS.Process(
+            target=run_executable, args=(command, log, environment, attributes or {}))
         self._process.start()
 
     @property

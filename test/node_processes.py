@@ -51,14 +51,14 @@ def messages_of_cycle(n_bands):
 class Process:
     """A process of an executable, whose output goes to a file."""
 
-    def __init__(self, executable, options, arguments, log, as_program):
+    def __init__(self, executable, options, arguments, log, as_program, attributes):
         self._log = log
         command = [str(EXECUTABLES / executable), *map(str, options), '--ros-args',
                    *map(str, arguments)]
         environment = {**os.environ, 'ROS_LOG_DIR': str(log.parent)}
         log.touch()
         if not as_program:
-            self._popen = Forked(command, log, environment)
+            self._popen = Forked(command, log, environment, attributes)
             return
         with open(log, 'wb') as stream:
             self._popen = subprocess.Popen(
@@ -108,10 +108,11 @@ class Processes:
         self._all = []
 
     def start(self, executable, *arguments, name='', namespace='/', options=(),
-              as_program=False, **parameters):
+              as_program=False, attributes=None, **parameters):
         """Start an executable with command line options and ROS parameters.
 
-        By default, it is a copy of a process that has imported it; a program takes longer.
+        By default, it is a copy of a process that has imported it, whose module gets `attributes`;
+        a program takes longer.
         """
         known = {parameter.name for parameter in NODES[executable]}
         steps = {key: value for key, value in STEPS.items() if key in known}
@@ -123,7 +124,7 @@ class Processes:
         if namespace != '/':
             arguments += ('-r', f'__ns:={namespace}')
         log = self._folder / f'{len(self._all)}_{name or executable}.log'
-        process = Process(executable, options, arguments, log, as_program)
+        process = Process(executable, options, arguments, log, as_program, attributes)
         self._all.append(process)
         return process
 

@@ -117,7 +117,8 @@ class Running:
         self.running = {}
         for role in FOLLOWING:
             self.start('/side', role)
-        self.start('/', 'fusion')
+        # Fewer references than 300 suffice: a user is compared with the nearest 40.
+        self.start('/', 'fusion', attributes={'_N_REFERENCES': 60})
         for role, member in ROSTER.items():
             if member.is_unique:
                 self.start('/front', role, **({'rest_s': 0.1} if role == 'bs' else {}))
