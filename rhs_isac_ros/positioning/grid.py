@@ -55,6 +55,8 @@ class _Limits(NamedTuple):
     # Remaining error of the log-likelihood after a step with the slopes, as a share of the loss
     # that the step recovers.
     step_error: float = 0.25
+    # Gain of log-likelihood that a peak may have off a region without extent along an axis.
+    off_region: float = 3.0
     # Squared Mahalanobis distance below which points belong to the same mode, and largest distance
     # at which they are compared, in radii of an ellipsoid that contains no other mode.
     same_mode: float = 2.0
@@ -134,7 +136,9 @@ class TemplateTable:
     def query(self, whitened: np.ndarray, prior: NuisancePrior, margin: float | np.ndarray
               ) -> Query:
         """Apply the matched filters to whitened signals, complex128 [N, N_B, N_SB F]."""
-        query = Query(*self.filters.apply(whitened), np.empty(()), prior, np.atleast_1d(margin))
+        thin = np.count_nonzero(np.ptp(self._resolution.bounds_m, axis=0) == 0)
+        query = Query(*self.filters.apply(whitened), np.empty(()), prior,
+                      np.atleast_1d(margin + thin * _LIMITS.off_region))
         return query._replace(bound=self._bound(query))
 
     def _starts(self, query: Query, peaks: Peaks) -> Starts:
