@@ -99,7 +99,10 @@ class Sheets(Mixture):
         size, by_point = np.ptp(bounds, axis=0), jacobian(means)
         prior = np.where(size > 0, 12 / np.maximum(size, _LIMITS.std_m)**2, 0.0)
         derivative = polar_derivative(means)
-        smallest = derivative @ np.swapaxes(derivative, 1, 2) * _LIMITS.std_m**2
+        # Where the region has no extent, the density contains no information across it.
+        spread = np.einsum('cpa,cab,cpb->c', by_point, covariances, by_point)
+        across = np.where(size > 0, 0.0, spread[:, None]) + _LIMITS.std_m**2
+        smallest = (derivative * across[:, None]) @ np.swapaxes(derivative, 1, 2)
         roots = np.linalg.cholesky(symmetric(covariances) + smallest)
         whitened = by_point @ roots
         shares, axes = np.linalg.eigh(

@@ -8,6 +8,7 @@ import pytest
 
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Pose, Scenario
+from rhs_isac_ros.model.gaussian import moments
 from rhs_isac_ros.model.geometry import polar_derivative, to_polar, to_positions
 from rhs_isac_ros.positioning import Sighting, make_estimator
 from rhs_isac_ros.positioning.fusion import Fuser, fuse
@@ -238,6 +239,23 @@ def test_a_line_meets_two_sheets_on_either_side():
     assert deviation > 3
     np.testing.assert_allclose(fused.mean, [x, mean, z], atol=0.05)
     np.testing.assert_allclose(np.sqrt(fused.covariance[1, 1]), deviation, rtol=0.02)
+
+
+def test_a_density_on_a_line_is_a_likelihood_along_it():
+    """Broad modes have the moments of samples in the region, and say nothing across a line."""
+    line, normal = np.array([[10.0, -5.0, 0.4], [10.0, 5.0, 0.4]]), np.linspace(-4, 4, 801)
+    y, std = 1.5 + 0.1 * normal, np.array([0.2, 0.02, 0.1])
+    positions, density = np.column_stack([0 * y + 10, y, 0 * y + 0.4]), np.exp(-normal**2 / 2)
+    found = Sheets.of_density(np.zeros(1), *(each[None] for each in moments(
+        density / density.sum(), to_polar(positions))), line)
+    turned = Pose((5.0, -5 * 3**0.5, 0.0), (0.0, 0.0, 0.5, 3**0.5 / 2), EXACT)
+    other = sheets(turned, [10.2, 1.7, 0.5], std=std)
+    weights = density * np.exp(log_likelihood(other, positions, std))
+    weights /= weights.sum()
+    mean = weights @ y
+    fused = fuse([Sighting(FRONT, found.to_mixture(FRONT), 1e-12, found), other], line)
+    np.testing.assert_allclose(fused.mean, [10.0, mean, 0.4], atol=0.002)
+    np.testing.assert_allclose(fused.covariance[1, 1], weights @ (y - mean)**2, rtol=0.05)
 
 
 def test_an_uncertain_pose_widens_the_posterior_by_its_covariance():
