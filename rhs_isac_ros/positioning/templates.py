@@ -52,26 +52,29 @@ _LIMITS = _Limits()
 
 
 def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None = None,
-             grid: Grid | None = None) -> dict[str, np.ndarray]:
+             grid: Grid | None = None, prior: NuisancePrior | None = None
+             ) -> dict[str, np.ndarray]:
     """Compute the arrays of a `TemplateTable`, for G templates and C cells.
 
-    The table covers a grid, by default that of the region. The arrays are ``filters``, the
-    conjugate templates, complex64 [N_B, N_SB, G, F]; ``slope_filters``, their derivatives with
-    respect to (r [m], u, v), complex64 [N_B, N_SB, G, 3, F]; ``energy`` of the whitened means,
-    float32 [C]; ``energy_slope``, its derivative, float32 [C, 3]; ``template_energy`` and
-    ``error``, energies of the whitened templates and of their differences from the means,
-    float32 [C]; ``curvature`` of the log-likelihood, float64 [C, 3, 3]; ``marginal``, the
-    curvature with the Q nuisance parameters that fit best, float64 [C, 3, 3], and ``regression``,
-    the derivatives of these, float64 [C, Q, 3]; ``spread``, the mean of the outer products of the
-    whitened means, ``limiter``, which multiplies whitened signals, and ``whitener``, which whitens
-    and limits signals, complex128 [N_B, N_SB F, N_SB F]; and ``normal``, points that represent a
-    standard Gaussian, float64 [128, 3]. Energies and derivatives are those of limited means.
+    The table covers a grid, by default that of the region, and has the nuisance parameters of a
+    prior, by default that of the model. The arrays are ``filters``, the conjugate templates,
+    complex64 [N_B, N_SB, G, F]; ``slope_filters``, their derivatives with respect to (r [m], u,
+    v), complex64 [N_B, N_SB, G, 3, F]; ``energy`` of the whitened means, float32 [C];
+    ``energy_slope``, its derivative, float32 [C, 3]; ``template_energy`` and ``error``, energies
+    of the whitened templates and of their differences from the means, float32 [C]; ``curvature``
+    of the log-likelihood, float64 [C, 3, 3]; ``marginal``, the curvature with the Q nuisance
+    parameters that fit best, float64 [C, 3, 3], and ``regression``, the derivatives of these,
+    float64 [C, Q, 3]; ``spread``, the mean of the outer products of the whitened means,
+    ``limiter``, which multiplies whitened signals, and ``whitener``, which whitens and limits
+    signals, complex128 [N_B, N_SB F, N_SB F]; and ``normal``, points that represent a standard
+    Gaussian, float64 [128, 3]. Energies and derivatives are those of limited means.
     """
     part, grid = grid, grid or lay_grid(model.scenario)
     points, (n_bands, n_rows) = grid.points, model.shape
     n_subbands = model.scenario.n_subbands
     n_frames, n_cells = n_rows // n_subbands, len(grid.node)
-    shape, prior = (n_bands, n_subbands, len(grid.nodes)), NuisancePrior(model)
+    shape = n_bands, n_subbands, len(grid.nodes)
+    prior = NuisancePrior(model) if prior is None else prior
     table: dict[str, np.ndarray] = {
         'filters': np.empty((*shape, n_frames), np.complex64),
         'slope_filters': np.empty((*shape, 3, n_frames), np.complex64),

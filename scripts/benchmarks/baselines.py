@@ -159,6 +159,7 @@ class ArrayLikelihood(Likelihood):
                       scenario.n_feeds)))
         # The prior of no parameters is the same for all beams.
         self.nuisance = NuisancePrior(MeasurementModel(scenario, dark))
+        self.nuisance.scaled_patterns = np.zeros((0, *receiver.shape))
         # The factor of a white covariance is its own inverse.
         self.factors = Factors.of_roots(self.nuisance, receiver.whitener)
         self.log_det = float(np.sum(self.factors.log_det))
@@ -171,7 +172,7 @@ def posterior_means(receiver: ArrayReceiver, received: np.ndarray) -> np.ndarray
     Every mode of the likelihood contributes with the mass of its Gaussian inside the region.
     """
     likelihood = ArrayLikelihood(receiver)
-    grid = TemplateTable(receiver.scenario, tabulate(receiver))
+    grid = TemplateTable(receiver.scenario, tabulate(receiver, prior=likelihood.nuisance))
     means = []
     for start in range(0, len(received), _BLOCK):
         signals = received[start:start + _BLOCK]
