@@ -28,7 +28,6 @@ from rhs_isac_ros.codebook.problem import Problem, Progress
 from rhs_isac_ros.codebook.unoptimised import STARTS
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.multipath import multipath_covariance
-from rhs_isac_ros.support import threads
 
 STEPS = 30
 # Ubuntu has no package of pymoo.
@@ -125,17 +124,13 @@ def test_every_method_lowers_an_objective_and_every_objective_is_lowered(
 
 
 @pytest.mark.parametrize('method', ['direct', 'lbfgs'])
-def test_methods_of_scipy_run_its_blas_with_one_thread(
-        scenario, positions, method, monkeypatch):
+def test_methods_of_scipy_run_its_blas_with_one_thread(scenario, positions, method):
     seen = []
 
     def record(_):
         libraries = ThreadpoolController().select(user_api='blas').lib_controllers
         seen.append({library.get_num_threads() for library in libraries})
 
-    # A process that has not imported SciPy yet.
-    for name, value in {'_shared': [], '_per_thread': [], '_has_scipy': False}.items():
-        monkeypatch.setattr(threads.one_blas_thread, name, value)
     with threadpool_limits(3, user_api='blas'):
         for library in ThreadpoolController().select(user_api='blas').lib_controllers:
             getattr(library, 'clear_controlling_thread', lambda: None)()
