@@ -121,7 +121,7 @@ class Running:
         self.start('/', 'fusion', attributes={'_N_REFERENCES': 60})
         for role, member in ROSTER.items():
             if member.is_unique:
-                self.start('/front', role, **({'rest_s': 0.1} if role == 'bs' else {}))
+                self.start('/front', role, **({'rest_s': 0.4} if role == 'bs' else {}))
         self.start('/front', 'user', name='users', user_count=N_USERS, mobility='random_walk',
                    speed_mps=1.0)
 
