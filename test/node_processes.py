@@ -57,6 +57,7 @@ class Process:
                    *map(str, arguments)]
         environment = {**os.environ, 'ROS_LOG_DIR': str(log.parent)}
         log.touch()
+        assert not (as_program and attributes)
         if not as_program:
             self._popen = Forked(command, log, environment, attributes)
             return

@@ -34,7 +34,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import convert, topics
-from rhs_isac_ros.support.plugins import PluginError
+from rhs_isac_ros.support.plugins import PluginError, trace_of
 from rhs_isac_ros.support.state_log import Line, StateLog
 
 
@@ -110,16 +110,19 @@ def steady_timer(node: Node, period_s: float, callback: Callable[[], float | Non
 
 @contextlib.contextmanager
 def surviving(node: Node) -> Iterator[None]:
-    """Let the node of a role note the failure of a plug-in in a block, and live on.
+    """Let a node note the failure of a plug-in in a block, and live on.
 
-    Its method `note` takes the error. Other nodes have no plug-ins, and raise it.
+    Nodes of roles have a method `note`, which counts the error as well. Others log it.
     """
     try:
         yield
     except PluginError as error:
-        if not (note := getattr(node, 'note', None)):
-            raise
-        note(error)
+        getattr(node, 'note', functools.partial(_log_failure, node))(error)
+
+
+def _log_failure(node: Node, error: PluginError) -> None:
+    text = f'plug-in: {error}'
+    journal(node).event(text, text + trace_of(error.__cause__))
 
 
 def set_period(timer: Timer, period_s: float | None) -> None:

@@ -67,9 +67,6 @@ def test_each_network_serves_its_users_and_none_of_the_other(running, other, sma
         watch = network.watch
         for user in users:
             watch.until_served(2, user, [network.process])
-        for kind in (m.GroundTruth, m.ReceivedSignals):
-            watch.until(lambda watch=watch, users=users, kind=kind: users <= {
-                one.user for one in watch.received[kind]}, kind.__name__)
         assert {end.user for end in watch.served} == users
         positions.append({tuple(truth.position) for truth in watch.received[m.GroundTruth]})
     assert not positions[0] & positions[1]

@@ -17,6 +17,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import endpoints, topics
 from rhs_isac_ros.ros.endpoints import BackgroundWorker, UserTopics
 from rhs_isac_ros.ros.roster import ROSTER
+from rhs_isac_ros.support import plugins
 
 
 def test_a_message_is_created_once_for_all_topics_with_subscribers(bench, probe):
@@ -227,6 +228,22 @@ def test_an_exception_of_a_job_is_raised_where_the_node_spins(each_bench, backgr
     background.run(fail, lambda result: None)
     with pytest.raises(ZeroDivisionError, match='of the job'):
         each_bench.until(lambda: False)
+
+
+def test_a_plug_in_that_fails_in_a_job_or_a_timer_is_logged(each_bench, background, capfd):
+    """Also by nodes without a role: the visualizer draws beams through boards and patterns."""
+    def fail():
+        with plugins.calling('Grid.linear'):
+            return 1 / 0
+    results = []
+    background.run(fail, lambda result: None)
+    background.run(lambda: 'next', results.append)
+    node = each_bench.add(Node, 'drawing')
+    timer = endpoints.steady_timer(node, 0.01, lambda: (results.append('drawn'), fail()))
+    each_bench.until(lambda: {*results} == {'next', 'drawn'})
+    timer.cancel()
+    log = capfd.readouterr().err
+    assert log.count('plug-in: Grid.linear: ZeroDivisionError: division by zero\nTraceback') == 2
 
 
 def test_closing_waits_for_the_running_job_and_discards_the_others(

@@ -80,7 +80,8 @@ with threadpool_limits(3, user_api='blas'):
     assert inside == dict.fromkeys(known, 1), (known, inside)
     assert numbers() == known
     assert set(known.values()) == {3}
-'''], capture_output=True, text=True, check=False, env=os.environ | {'OPENBLAS_NUM_THREADS': '3'})
+'''], capture_output=True, text=True, check=False, timeout=60,
+        env=os.environ | {'OPENBLAS_NUM_THREADS': '3'})
     assert not done.returncode, done.stderr
 
 

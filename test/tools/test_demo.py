@@ -7,11 +7,14 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
+from rclpy.node import Node
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.monitoring.cycle_log import CycleRecord
+from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning import Site
 from rhs_isac_ros.protocol import messages as m
+from rhs_isac_ros.ros.diagnostics import TABLE_PROGRESS, make_reporter
 from rhs_isac_ros.ros.recording import read_networks
 from rhs_isac_ros.ros.roster import FOLLOWING, ROSTER
 from rhs_isac_ros.tools import demo
@@ -206,3 +209,15 @@ def test_the_wait_continues_while_a_node_computes_a_table(monkeypatch, capsys):
         types.SimpleNamespace(complete=[]), processes, 1, lambda *_: None)
     assert clock.now_s == 480.0
     assert capsys.readouterr().err == 'positioner computes a table of templates\n'
+
+
+def test_the_progress_of_tables_is_that_of_all_surfaces(bench):
+    node = bench.add(Node, 'observer')
+    progress = demo._table_progress(node)
+    publish = []
+    for space, share in (('front', '40 %'), ('side', '5 %')):
+        report = Report(False, '', {TABLE_PROGRESS: share})
+        publish.append(make_reporter(
+            bench.add(Node, 'positioner', namespace=space), lambda report=report: report))
+    bench.until(lambda: [one() for one in publish] and progress == {
+        'front/positioner': '40 %', 'side/positioner': '5 %'}, 'both')
