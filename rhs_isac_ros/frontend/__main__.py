@@ -12,7 +12,12 @@ import numpy as np
 from rhs_isac_ros.frontend.opensourceris import COLUMNS, ROWS, OpenSourceRis
 from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.frontend.surface import SurfaceFault
-from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float, positive_float
+from rhs_isac_ros.support.arguments import (
+    ArgumentParser,
+    DefaultsFormatter,
+    nonnegative_float,
+    positive_float,
+)
 from rhs_isac_ros.support.exits import exit_code_of
 
 
@@ -25,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The script names itself.
         prog=os.environ.get('RHS_ISAC_PROGRAM', 'python3 -m rhs_isac_ros.frontend'),
         description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+        formatter_class=DefaultsFormatter)
     commands = parser.add_subparsers(dest='command', required=True)
     for name, text in (
             ('check', 'print serial number, supply and times, and read each element back'),

@@ -11,6 +11,7 @@ from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.waveguides import board_of_guides
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
+    DefaultsFormatter,
     input_file,
     nonnegative_float,
     output_file,
@@ -26,8 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return the code of `exit_code_of`."""
     parser = ArgumentParser(prog='python3 -m rhs_isac_ros.model', description=__doc__)
     kinds = parser.add_subparsers(dest='kind', required=True)
-    style = argparse.ArgumentDefaultsHelpFormatter
-    guides = kinds.add_parser('waveguides', formatter_class=style,
+    guides = kinds.add_parser('waveguides', formatter_class=DefaultsFormatter,
                               help='compute waveguides with coupled dipoles')
     guides.add_argument('--scenario', '--config', type=input_file, required=True,
                         help='YAML file of the scenario; its field board is ignored')
@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                         help='loss of the guides [dB/m]')
     guides.add_argument('--across', type=positive_float, default=0.07,
                         help='position of the elements between the walls of a guide, from 0 to 1')
-    read = kinds.add_parser('touchstone', formatter_class=style,
+    read = kinds.add_parser('touchstone', formatter_class=DefaultsFormatter,
                             help='convert a Touchstone file; needs scikit-rf')
     read.add_argument('file', type=input_file,
                       help='Touchstone file: ports of the feeds, then those of the elements')

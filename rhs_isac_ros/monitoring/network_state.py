@@ -15,7 +15,7 @@ from rhs_isac_ros.protocol.ground_truth import TruePositions
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.support.fields import finite
 
-RESTING = 'resting'
+RESTING = BsState.RESTING.value
 # Time over which the rate of cycles is averaged [s].
 _RATE_WINDOW_S = 10.0
 # Nodes report once a second. A node counts as silent after three missing reports.

@@ -536,9 +536,9 @@ class BaseStation(SignalCollector):
             _last_row((BsState.CONFIGURING,), (_abandon,), outcome=Outcome.RHS_SILENT),
             # Repeat the command too, because the channel may have missed the report of the RHS.
             _retry_row((BsState.SOUNDING,), (_command_silent_bands, _request_pilots),
-                   outcome=Outcome.RETRY_BAND),
+                       outcome=Outcome.RETRY_BAND),
             _last_row((BsState.SOUNDING,), (_abandon,), guard=_signals_due,
-                     outcome=Outcome.CHANNEL_SILENT),
+                      outcome=Outcome.CHANNEL_SILENT),
             _last_row((BsState.SOUNDING,), (_remove_user, _abandon), outcome=Outcome.USER_GONE),
             _retry_row((BsState.ESTIMATING,), (_resend_signals,), outcome=Outcome.RETRY_POSITION),
             _last_row((BsState.ESTIMATING,), (_abandon,), outcome=Outcome.POSITIONER_SILENT),
@@ -552,12 +552,12 @@ class BaseStation(SignalCollector):
             # The channel may have missed the beam or its configuration, or another surface can
             # carry the data.
             _retry_row((BsState.TRANSMITTING,), (_note_loss, _resend_signals, _send_downlink),
-                   outcome=Outcome.RETRY_DATA),
+                       outcome=Outcome.RETRY_DATA),
             _last_row((BsState.TRANSMITTING,), (_note_loss, _abandon), outcome=Outcome.DATA_LOST)),
         *on(m.RhsConfiguration, 'configured')(
             Row(ANY, (_await_surface,), guard=_shown_late, outcome=Outcome.WRONG_CYCLE)),
         *on(m.RhsConfiguration, 'configured',
-              _SOUNDED_HERE | SignalCollector._OF_CYCLE | _OF_CODEBOOK)(
+            _SOUNDED_HERE | SignalCollector._OF_CYCLE | _OF_CODEBOOK)(
             # A report concerns the configurations for positioning in a band, or that of the beam.
             Row((BsState.CONFIGURING,), (_store_configured, _request_pilots), BsState.SOUNDING,
                 guard=_last_configuration),

@@ -125,9 +125,9 @@ class RhsController(StateMachine):
             Row(ANY, (_apply_band,), guard=_repeats_command, outcome=Outcome.DUPLICATE),
             Row(ANY, guard=_was_executed, outcome=Outcome.STALE_COMMAND),
             Row(ANY, (_apply_band,), RhsControllerState.POSITIONING)),
-        *on(m.Beam, 'beam', {_wrong_cycle: Outcome.WRONG_CYCLE,
-                     _wrong_user: Outcome.WRONG_USER,
-                     _wrong_instance: Outcome.WRONG_INSTANCE})(
+        *on(m.Beam, 'beam', {
+            _wrong_cycle: Outcome.WRONG_CYCLE, _wrong_user: Outcome.WRONG_USER,
+            _wrong_instance: Outcome.WRONG_INSTANCE})(
             Row(ANY, (_log_unknown_codebook,), guard=_wrong_codebook,
                 outcome=Outcome.WRONG_CODEBOOK),
             Row((RhsControllerState.POSITIONING,), (_apply_beam,),

@@ -246,10 +246,9 @@ class User(StateMachine):
             # The base station may wait longer than the user, so a grant may follow the timeout.
             Row(NOT_GRANTED, (_publish_position,), UserState.GRANTED),
             Row((UserState.GRANTED,))),
-        *on(m.PilotRequest, 'pilot_request', {_other_user: None,
-                             _other_instance: None,
-                             _wrong_cycle: Outcome.WRONG_CYCLE,
-                             _other_granted: Outcome.WRONG_USER})(
+        *on(m.PilotRequest, 'pilot_request', {
+            _other_user: None, _other_instance: None, _wrong_cycle: Outcome.WRONG_CYCLE,
+            _other_granted: Outcome.WRONG_USER})(
             # A request that overtakes the grant replaces it.
             Row((UserState.ACKNOWLEDGED,), (_publish_position, _send_pilots), UserState.GRANTED,
                 guard=_new_request),
@@ -257,10 +256,9 @@ class User(StateMachine):
             # The channel may have missed the pilots or the position.
             Row((UserState.GRANTED,), (_publish_position, _send_pilots),
                 outcome=Outcome.ASKED_AGAIN, restart_timeout=True)),
-        *on(m.Data, 'downlink', {_not_delivered_downlink: None,
-                     _other_user: None,
-                     _wrong_cycle: Outcome.WRONG_CYCLE,
-                     _not_granted: None})(
+        *on(m.Data, 'downlink', {
+            _not_delivered_downlink: None, _other_user: None, _wrong_cycle: Outcome.WRONG_CYCLE,
+            _not_granted: None})(
             Row((UserState.GRANTED,), (_send_uplink,), UserState.LISTENING),
             Row((UserState.LISTENING,), (_send_uplink,), outcome=Outcome.ASKED_AGAIN)),
     )

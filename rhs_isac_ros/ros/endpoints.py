@@ -19,7 +19,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -108,29 +108,34 @@ def steady_timer(node: Node, period_s: float, callback: Callable[[], float | Non
     return timer
 
 
+@runtime_checkable
+class _OfRole(Protocol):
+    """A node of a role, which counts failures of plug-ins."""
+
+    def note(self, error: PluginError) -> None:
+        """Count and log a failure."""
+
+
 @contextlib.contextmanager
 def surviving(node: Node) -> Iterator[None]:
-    """Let a node note the failure of a plug-in in a block, and live on.
-
-    Nodes of roles have a method `note`, which counts the error as well. Others log it.
-    """
+    """Let a node continue after the failure of a plug-in in a block, which it logs."""
     try:
         yield
     except PluginError as error:
-        getattr(node, 'note', functools.partial(_log_failure, node))(error)
-
-
-def _log_failure(node: Node, error: PluginError) -> None:
-    text = f'plug-in: {error}'
-    journal(node).event(text, text + trace_of(error.__cause__))
+        if isinstance(node, _OfRole):
+            node.note(error)
+        else:
+            text = f'plug-in: {error}'
+            journal(node).event(text, text + trace_of(error.__cause__))
 
 
 def set_period(timer: Timer, period_s: float | None) -> None:
-    """Let a timer begin another period [s], unless it has this period or None is given."""
-    if period_s is not None and (
-            timer.is_canceled() or timer.timer_period_ns != int(1e9 * period_s)):
-        timer.timer_period_ns = int(1e9 * period_s)
-        timer.reset()
+    """Start a timer with a period [s], unless it runs with this period or None is given."""
+    if period_s is not None:
+        period_ns = max(round(1e9 * period_s), 1)
+        if timer.is_canceled() or timer.timer_period_ns != period_ns:
+            timer.timer_period_ns = period_ns
+            timer.reset()
 
 
 class _NoPublisher(Publisher):

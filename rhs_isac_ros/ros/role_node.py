@@ -316,8 +316,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         # The timer follows the steady clock, but the speed of a simulation is unknown, so poll.
         if self.clocks.is_simulated and self._in_world():
             delay_s = min(delay_s, _WORLD_POLL_S)
-        self._timer.timer_period_ns = max(int(delay_s * 1e9), 1)
-        self._timer.reset()
+        endpoints.set_period(self._timer, delay_s)
 
     def publish(self, message: m.Message) -> bool:
         """Publish a message; return False if it is invalid (logged), or if the node stands by."""

@@ -42,9 +42,17 @@ class ArgumentParser(argparse.ArgumentParser):
         self.exit(2, f'{self.prog}: error: {text}; see {self.prog} --help\n')
 
 
-class HelpFormatter(
-        argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
-    """A formatter that shows defaults and keeps line breaks of the description and epilog."""
+class DefaultsFormatter(argparse.ArgumentDefaultsHelpFormatter):
+    """A formatter that shows defaults that the help of an option does not state."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        is_stated = action.default is None or action.default is False or (
+            '(default' in (action.help or ''))
+        return action.help if is_stated else super()._get_help_string(action)
+
+
+class HelpFormatter(DefaultsFormatter, argparse.RawDescriptionHelpFormatter):
+    """A formatter that also keeps line breaks of the description and epilog."""
 
 
 def typed(parse: Callable[[str], _Parsed]) -> Callable[[str], _Parsed]:

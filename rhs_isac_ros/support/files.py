@@ -198,7 +198,7 @@ def parse_yaml(text: str) -> Any:
     Raises ValueError if the text is invalid, too long or nested too deeply, repeats a key, or
     contains references, with which a short text can describe an enormous value.
     """
-    if len(text) > _MAX_YAML_BYTES:
+    if len(text.encode()) > _MAX_YAML_BYTES:
         raise ValueError(f'more than {_MAX_YAML_BYTES} bytes')
     depth = 0
     try:

@@ -20,7 +20,6 @@ from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning import ModelError, Site, SiteError
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros import convert, diagnostics, endpoints, topics
-from rhs_isac_ros.ros.endpoints import subscribe
 from rhs_isac_ros.ros.environment import check_environment
 from rhs_isac_ros.ros.recording import RecordingError, read, read_networks
 from rhs_isac_ros.ros.run import StartError, parse, spin
@@ -145,7 +144,8 @@ def subscribe_codebooks(
             node.get_logger().warning(f'dropped codebook: {error}')
             return
         on_codebook(codebook)
-    subscribe(node, ros.Codebook, topics.CODEBOOK, receive, endpoints.LATCHED, raw=True)
+    endpoints.subscribe(
+        node, ros.Codebook, topics.CODEBOOK, receive, endpoints.LATCHED, raw=True)
 
 
 def choose_scenario(config: Path | None, recording: Path | None = None,

@@ -21,6 +21,7 @@ from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.endpoints import (
     create_publisher,
     full_name,
+    set_period,
     steady_timer,
     subscribe_messages,
 )
@@ -151,8 +152,7 @@ class RepublisherNode(Node):
     def _continue(self) -> None:
         """Publish the messages that are due, and set the timer for the next one."""
         if (wait_s := next(self._waits_s, None)) is not None:
-            self._timer.timer_period_ns = max(int(wait_s * 1e9), 1)
-            self._timer.reset()
+            set_period(self._timer, wait_s)
             return
         self._timer.cancel()
         for name in self._message_publishers:

@@ -8,6 +8,7 @@ import pytest
 
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
+    DefaultsFormatter,
     check_distinct,
     input_file,
     interval,
@@ -32,6 +33,18 @@ def test_ranges_of_numbers_contain_their_ends_unless_open():
     for text in ('1.5', 'x', ''):
         with pytest.raises(argparse.ArgumentTypeError, match=f"^'{text}', expected an integer, "):
             positive_int(text)
+
+
+def test_help_states_each_default_once():
+    parser = ArgumentParser(formatter_class=DefaultsFormatter)
+    parser.add_argument('--seed', default=0, help='seed')
+    parser.add_argument('--jobs', default=-1, help='jobs (default: one per core)')
+    parser.add_argument('--file', help='file')
+    parser.add_argument('--quiet', action='store_true', help='quiet')
+    lines = parser.format_help().splitlines()[-4:]
+    assert [' '.join(line.split()[2:]) for line in lines[:3]] == [
+        'seed (default: 0)', 'jobs (default: one per core)', 'file']
+    assert lines[3].split() == ['--quiet', 'quiet']
 
 
 def test_an_interval_has_two_positive_ends_in_order():

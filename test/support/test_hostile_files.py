@@ -53,8 +53,10 @@ def test_a_file_without_end(tmp_path, monkeypatch):
     monkeypatch.setattr('rhs_isac_ros.support.files._MAX_YAML_BYTES', 1000)
     (tmp_path / 'longest').write_text(1000 * '1')
     assert read_yaml(tmp_path / 'longest') == int(1000 * '1')
-    with pytest.raises(ValueError, match='/dev/zero: cannot be read: more than 1000 bytes'):
-        read_yaml('/dev/zero')
+    (tmp_path / 'umlauts').write_text('a' + 600 * 'ä', encoding='utf-8')
+    for file in ('/dev/zero', tmp_path / 'umlauts'):
+        with pytest.raises(ValueError, match=f'{file}: cannot be read: more than 1000 bytes'):
+            read_yaml(file)
 
 
 def npy(shape, kind='<f8'):
