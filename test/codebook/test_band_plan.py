@@ -90,6 +90,7 @@ def test_the_candidates_are_sorted_and_reported(small):
         assert candidate.error_m2 > 0
 
 
+@pytest.mark.slow
 def test_a_raster_with_few_plans_has_few_candidates(small):
     (only,) = band_plan.choose_bands(small, [(2.5e9, 2.5e9), (3e9, 3e9)], 2, raster_hz=10e6,
                            effort=SHORT)

@@ -105,6 +105,7 @@ def test_resume_continues_from_the_output(call, files):
     assert second.value_m2 < first.value_m2
 
 
+@pytest.mark.slow
 def test_resume_prefers_the_partial_file_of_an_unfinished_run(
         call, files, monkeypatch, raising_after):
     """A killed run leaves OUTPUT.part and does not change the last output."""

@@ -15,6 +15,7 @@ from rhs_isac_ros.support.pictures import write_picture
 HISTORY = [Progress(0, 1, 3.0, 0.1), Progress(1, 2, 1.0, 0.2)]
 
 
+@pytest.mark.slow
 def test_draws_a_single_band(scenario, tmp_path):
     pytest.importorskip('matplotlib')
     changed = Scenario(**scenario.changes() | {'center_frequencies_hz': [2.5e9]})

@@ -86,6 +86,7 @@ def test_focal_points_scan_the_width_of_the_region(scenario):
         assert (heights[1::2] > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('scenario', SCENARIOS[:2])
 def test_each_beam_is_nearly_strongest_at_its_focal_point(scenario, plain):
     """Compares the received power, without path loss, at all focal points."""

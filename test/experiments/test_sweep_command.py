@@ -66,6 +66,7 @@ def test_a_cluster_and_an_interrupted_run_write_the_same_files(
     assert files(tmp_path / 'again') == files(tmp_path / 'dask')
 
 
+@pytest.mark.slow
 def test_every_setting_and_measure_has_a_row(sweep, tmp_path):
     assert sweep('folder', '--jobs', '1', '--codebook', 'optimize', '--objective', 'crlb',
                  '--steps', '2', '--measure', 'crlb,mse,capacity', '--positions', '20', '--vary',

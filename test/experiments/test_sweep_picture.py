@@ -90,6 +90,7 @@ def test_capacities_have_a_prefix_and_errors_of_different_sizes_a_logarithmic_sc
     write_picture(tmp_path / 'a.svg', figure)
 
 
+@pytest.mark.slow
 def test_infinite_and_missing_values_are_left_out(tmp_path):
     for number in (np.inf, np.nan):
         figure = drawn('n_frames=1,2,3', value=lambda scenario, number=number: (

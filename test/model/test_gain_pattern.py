@@ -194,6 +194,7 @@ def broken(angles):
         install('antennas', self.CODE, {plugins.GAIN_PATTERNS: {
             'panel': 'patch', **{name: name for name in names}}})
 
+    @pytest.mark.slow
     def test_a_file_may_name_a_pattern(self, tmp_path):
         (tmp_path / 'my.yaml').write_text('element_gain: panel\nuser_gain: sharp\n')
         scenario = Scenario.from_yaml(tmp_path / 'my.yaml')

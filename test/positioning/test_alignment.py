@@ -59,6 +59,7 @@ def test_wrong_candidates_and_outliers_do_not_matter():
     assert normalised_error(found) < 25
 
 
+@pytest.mark.slow
 def test_users_in_a_plane_determine_a_pose():
     plane = BOUNDS * [1, 1, 0]
     found = estimate_pose(*sightings(

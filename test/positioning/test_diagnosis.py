@@ -311,6 +311,7 @@ def test_blocked_users_are_the_cause_unless_the_residuals_deviate(shipped):
     assert diagnosis_of(found, True)['no_fix.cause'] in (diagnosis.LEVEL, diagnosis.SPREAD)
 
 
+@pytest.mark.slow
 def test_signals_of_the_model_have_no_cause(shipped, table1_estimator):
     assert diagnosis_of(located(Scenario(), shipped, table1_estimator), False) == {}
 

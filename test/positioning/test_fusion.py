@@ -119,6 +119,7 @@ def test_the_posterior_is_the_integral_of_the_product(others):
     assert_moments(fuse(sightings, BOUNDS), *integrated(sightings))
 
 
+@pytest.mark.slow
 def test_only_modes_that_agree_remain():
     # The wrong modes of one surface are at other places than those of the other one.
     front = sheets(FRONT, [PLACE, PLACE + [0.6, 0.0, 0.0]], [0.0, 1.0])
@@ -127,6 +128,7 @@ def test_only_modes_that_agree_remain():
     assert_moments(fuse(sightings, BOUNDS), *integrated(sightings))
 
 
+@pytest.mark.slow
 def test_many_modes_at_regular_distances_have_the_moments_of_all_their_products():
     """Of 1728 similar products, none may be left out or have too few samples."""
     std, steps_m = np.array([0.02, 0.3, 0.3]), np.arange(-6, 6)[:, None]
@@ -158,6 +160,7 @@ TURNED = Pose((5.0, -75**0.5, 0.0), (0.0, 0.0, 0.5, 0.75**0.5), EXACT)
     ([TURNED], [0.005, 0.1, 0.1], [[9.8, -3.0, -0.5]] * 2, 'z'),
     ([OPPOSITE, SIDE], [0.02, 0.1, 0.2], [[8.0, 1.0, 0.2]] * 3, 'z'),
 ], ids=['rim', 'apart', 'two arcs', 'other height', '60 degrees', 'three'])
+@pytest.mark.slow
 def test_sheets_that_are_broad_across_have_the_moments_of_their_product(
         others, std, places, wide):
     std = np.array(std)
@@ -201,6 +204,7 @@ def multilaterated(sightings, std, n=40_000):
     return mean, (places - mean).T @ ((places - mean) * weights[:, None])
 
 
+@pytest.mark.slow
 def test_many_thin_sheets_of_three_surfaces_meet_in_points():
     std, rng = np.array([0.001, 0.05, 0.05]), np.random.default_rng(0)
     sightings = [sheets(pose, PLACE + rng.normal(scale=0.3, size=(8, 3)), np.zeros(8), std)
@@ -267,6 +271,7 @@ def test_an_uncertain_pose_widens_the_posterior_by_its_covariance():
     np.testing.assert_allclose(found.mixture.moments()[1] - alone, 0.09 * np.eye(3), atol=0.01)
 
 
+@pytest.mark.slow
 def test_the_constant_part_of_a_covariance_is_that_of_displaced_poses():
     """To first order in the errors of both poses: the slopes are differences."""
     one, other = (dataclasses.replace(pose, uncertainty=(0.02, 0.2)) for pose in (FRONT, SIDE))

@@ -90,6 +90,7 @@ def test_the_sign_of_the_speed_across_the_line_of_sight_is_found(walking):
     assert np.count_nonzero(squares > chdtri(2, 1e-3)) <= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('size', [3, 6], ids=['positions', 'velocities'])
 def test_a_prior_changes_positions_and_velocities_together(walking, size):
     """The covariance was negative where a prior changed that of positions alone."""

@@ -62,6 +62,7 @@ def test_training_reduces_the_error(scenario, codebook, training):
     assert epochs[-1][1] < 0.5 * epochs[0][1]
 
 
+@pytest.mark.slow
 def test_the_pairs_are_split_7_to_1_5_to_1_5(scenario, codebook, training):
     network, epochs = training
     first, second = int(0.7 * PAIRS), int(0.85 * PAIRS)
@@ -107,6 +108,7 @@ def test_networks_are_reproducible_by_their_seed(scenario, codebook):
     assert not np.isclose(first.w_in, other.w_in).all()
 
 
+@pytest.mark.slow
 def test_batches_grow_and_training_stops_when_the_validation_error_does_not_fall(
         scenario, codebook, monkeypatch):
     sizes, epochs, make = [], [], neural._regressor

@@ -73,6 +73,7 @@ def test_the_error_for_an_unknown_name_lists_all_estimators(small):
         make_estimator('best', small.scenario, small.codebook)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('name', 'options', 'message'), [
     ('absent', {}, 'absent = guesses:Absent of guesses: cannot be loaded: AttributeError'),
     ('no_estimator', {},

@@ -158,6 +158,7 @@ def test_the_posterior_is_the_prior_times_the_likelihood(table1_estimator, model
     assert np.mean(errors) < 0.1
 
 
+@pytest.mark.slow
 def test_modes_with_unknown_phases_are_as_broad_as_the_likelihood_near_the_prior():
     """The reference weighs points drawn from the prior with the likelihood at each of them."""
     scenario = Scenario(elements_per_side=6, n_frames=4, band_phase_std_rad='unknown')
@@ -182,6 +183,7 @@ def test_modes_with_unknown_phases_are_as_broad_as_the_likelihood_near_the_prior
     np.testing.assert_allclose(sizes, 0, atol=0.5)
 
 
+@pytest.mark.slow
 def test_a_codebook_that_has_not_been_seen_gives_the_same_posterior(
         lazy, table1_estimator, model):
     rng = np.random.default_rng(7)

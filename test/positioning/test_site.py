@@ -52,6 +52,7 @@ def test_all_surfaces_locate_better_than_one(estimator, cycles):
     assert both < 0.7 * min(error_m2(['front']), error_m2(['side']))
 
 
+@pytest.mark.slow
 def test_a_surface_without_a_signal_is_left_out(estimator, cycles):
     cycle = cycles[1][0]
     silent = np.zeros_like(cycle['side'])

@@ -244,6 +244,7 @@ def test_a_prediction_moves_with_the_velocity_and_leaves_the_track(tracker, foll
     assert follow([times_s[-1] + PERIOD_S]).n_phases == 11
 
 
+@pytest.mark.slow
 def test_an_earlier_phase_does_not_change_the_track(tracker, sample, table1_estimator):
     signals = [sample(START + k * PERIOD_S * VELOCITY) for k in range(6)]
     expected = Tracker(table1_estimator)
@@ -368,6 +369,7 @@ def test_correlated_multipath_does_not_narrow_the_covariance(table1_estimator, s
     assert again.n_phases == 1
 
 
+@pytest.mark.slow
 def test_a_time_that_is_not_finite_is_an_error_and_does_not_change_the_track(
         table1, table1_estimator):
     bad_s = np.nan, np.inf, -np.inf, 1j, None

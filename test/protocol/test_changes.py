@@ -160,6 +160,7 @@ def test_the_old_estimator_is_kept_if_the_new_one_cannot_be_built(network, make_
     assert list(estimators(net).values())[-1] == 'ml'
 
 
+@pytest.mark.slow
 def test_the_last_of_several_estimators_is_used(network):
     net = network(make_s=0.5, step_timeout_s=2.0, rest_s=0.5)
     net.run_cycles(1)

@@ -147,6 +147,7 @@ def make_network(make_site):
     return make
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('names', [('front', 'side'), ('side', 'front', 'rear')])
 def test_data_go_over_the_surface_with_the_largest_expected_capacity(make_network, names):
     net = make_network(*names)
@@ -182,6 +183,7 @@ def test_one_surface_is_a_site_without_handovers(make_network):
     assert net.counters() == {}
 
 
+@pytest.mark.slow
 def test_similar_capacities_cause_no_handover(make_network):
     net = make_network('front', 'side')
     net.change('bs', handover_ratio=1.1)
@@ -211,6 +213,7 @@ def test_a_surface_that_does_not_answer_delays_one_cycle(make_network, role):
     assert net.served() == [1] * len(net.outcomes())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('rest_s', [0.0, 0.1])
 def test_a_surface_that_is_always_slower_takes_part(make_network, rest_s):
     net = make_network('front', 'side', rest_s=rest_s)
@@ -224,6 +227,7 @@ def test_a_surface_that_is_always_slower_takes_part(make_network, rest_s):
     assert net.cycles_at(NEAR['side'], 3) == ['side'] * 3
 
 
+@pytest.mark.slow
 def test_data_that_a_surface_does_not_deliver_go_over_another_one_in_the_same_cycle(make_network):
     net = make_network('front', 'side', rest_s=1.0)
     net.cycles_at(NEAR['side'], 2)
@@ -237,6 +241,7 @@ def test_data_that_a_surface_does_not_deliver_go_over_another_one_in_the_same_cy
     assert net.served() == [1] * len(net.outcomes())
 
 
+@pytest.mark.slow
 def test_data_under_way_during_a_handover_arrive(make_network):
     net = make_network('front', 'side')
     net.cycles_at(NEAR['side'], 2)
@@ -253,6 +258,7 @@ def test_data_under_way_during_a_handover_arrive(make_network):
     assert net['bs'].state is BsState.RESTING
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('kind', [m.PositionEstimate, m.Beam])
 @pytest.mark.parametrize('recipient', ['bs', 'transmission', 'side/transmission'])
 def test_one_lost_message_ends_no_cycle(make_network, kind, recipient):

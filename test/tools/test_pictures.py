@@ -75,6 +75,7 @@ def test_no_text_is_cut_off_or_overlaps_another(monkeypatch):
         assert not box.padded(-1).overlaps(second.padded(-1)), (one, other)
 
 
+@pytest.mark.slow
 def test_both_views_show_region_users_and_ellipses_at_their_positions():
     scenario = Scenario()
     figure = compose_scene(make_scene(scenario, 3), scenario)
@@ -146,6 +147,7 @@ def test_title_beam_and_lobe_are_of_one_user():
             if type(patch) is Polygon] == [look(1).colour]
 
 
+@pytest.mark.slow
 def test_a_rectangular_surface_is_shown_from_the_front():
     """Twelve columns along y and three rows along z, over a flat region."""
     scenario = Scenario(elements_per_side=(12, 3), roi_size_m=(10.0, 10.0, 0.0))
@@ -162,6 +164,7 @@ def test_a_rectangular_surface_is_shown_from_the_front():
     assert (left, bottom) == (-right, -top) < (0, 0)
 
 
+@pytest.mark.slow
 def test_an_empty_scene_is_drawn(small, tmp_path):
     write_picture(tmp_path / 'scene.png', compose_scene(SceneState(), small.scenario))
 
@@ -174,6 +177,7 @@ def panels(make_cycles):
     return figure.axes
 
 
+@pytest.mark.slow
 def test_every_cycle_has_its_number_beside_its_true_position(panels, make_cycles):
     numbers = [text for text in panels[1].texts if isinstance(text, Annotation)
                and text.get_text().isdigit()]
@@ -208,6 +212,7 @@ def test_an_ellipse_beyond_all_bounds_does_not_shrink_the_region(make_cycles):
     assert np.diff(view.get_xlim()) < 25
 
 
+@pytest.mark.slow
 def test_of_many_cycles_and_users_only_some_are_labelled(make_cycles):
     legend, view, _ = compose_cycles(make_cycles(150, n_users=9), Scenario()).axes
     assert [text.get_text() for text in legend.get_legend().get_texts()][-2:] == [
