@@ -32,8 +32,8 @@ from rhs_isac_ros.support.threads import map_blocks
 _CHUNK = 512
 # Options of commands for files that describe a system.
 _FILES = {
-    'config': "scenario file; by default that of a recording, or else the paper's Table I",
-    'codebook': 'codebook to assume; by default that of a recording',
+    'config': "scenario file; by default that of the recording, if any, or the paper's Table I",
+    'codebook': 'codebook to assume; by default that of the recording, if any',
     'calibration': 'calibration of the surface; by default the surface of the scenario',
     'system': 'system file, which names these files, except for those that are also given'}
 

@@ -10,6 +10,7 @@ from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.codebook.library import Library
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.geometry import element_intervals_m
+from rhs_isac_ros.support.files import read_yaml
 from rhs_isac_ros.system import System
 
 CONFIG = Path(__file__).parents[1] / 'config'
@@ -31,6 +32,11 @@ def test_every_file_is_a_scenario_a_codebook_a_site_or_one_of_parameters():
     ('coupled', {'board'})])
 def test_scenarios_change_only_what_their_names_promise(name, changed):
     assert SCENARIOS[name].changes().keys() == changed
+
+
+def test_table1_lists_all_fields():
+    fields = {field.name for field in dataclasses.fields(Scenario)}
+    assert read_yaml(CONFIG / 'table1.yaml').keys() == fields
 
 
 def test_quick_is_smaller_and_wideband_has_four_bands():

@@ -5,7 +5,6 @@ import itertools
 import sys
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.protocol.events import Send
 from rhs_isac_ros.protocol.role import NewestDict, Role
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
@@ -35,31 +34,25 @@ class Radio(Role):
         self._waiting = NewestDict(_MAX_PENDING)
         self._serial = itertools.count()
 
-    def handle(self, event, now_s):
-        """Process a message and return the messages to send."""
+    def react(self, event):
+        """Process a message, and answer the pilots whose configurations have arrived."""
         match event:
             case m.RhsConfiguration(mode=m.Mode.POSITIONING):
                 self._applied.put((event.cycle_id, event.band), event.analog)
             case m.Pilot():
                 self._waiting.put(next(self._serial), event)
             case m.Data(stage=m.Stage.OFFERED):
-                bits = self._carry(event)
-                return [Send(dataclasses.replace(event, stage=m.Stage.DELIVERED, bits=bits))]
-        return self._answer()
-
-    def _answer(self):
-        """Answer the pilots whose configurations have arrived."""
-        answers = []
+                self.send(dataclasses.replace(
+                    event, stage=m.Stage.DELIVERED, bits=self._carry(event)))
         for serial, pilot in list(self._waiting.items()):
             applied = self._applied.get((pilot.cycle_id, pilot.band))
             if applied is None:
                 continue
             del self._waiting[serial]
             feeds = self._measure(pilot.band, applied, pilot)
-            answers.append(Send(m.FeedSignals(
+            self.send(m.FeedSignals(
                 cycle_id=pilot.cycle_id, user=pilot.user, user_instance=pilot.sender,
-                band=pilot.band, signals=(feeds.T / pilot.symbols).T)))
-        return answers
+                band=pilot.band, signals=(feeds.T / pilot.symbols).T))
 
 
 class RadioNode(RoleNode):

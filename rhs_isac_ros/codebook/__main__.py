@@ -28,7 +28,6 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.support import streams
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
-    DefaultsFormatter,
     check_distinct,
     check_effect,
     input_file,
@@ -70,8 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     is_library = arguments[:1] == ['library']
     parser = ArgumentParser(
         prog='python3 -m rhs_isac_ros.codebook' + is_library * ' library',
-        description=_LIBRARY if is_library else __doc__,
-        formatter_class=DefaultsFormatter)
+        description=_LIBRARY if is_library else __doc__)
     (_add_library_options if is_library else add_options)(parser)
     options = parser.parse_args(arguments[is_library:])
     (check_distinct if is_library else check)(parser, options)

@@ -12,12 +12,7 @@ import numpy as np
 from rhs_isac_ros.frontend.opensourceris import COLUMNS, ROWS, OpenSourceRis
 from rhs_isac_ros.frontend.opensourceris_emulator import EmulatedBoard
 from rhs_isac_ros.frontend.surface import SurfaceFault
-from rhs_isac_ros.support.arguments import (
-    ArgumentParser,
-    DefaultsFormatter,
-    nonnegative_float,
-    positive_float,
-)
+from rhs_isac_ros.support.arguments import ArgumentParser, nonnegative_float, positive_float
 from rhs_isac_ros.support.exits import exit_code_of
 
 
@@ -29,15 +24,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = ArgumentParser(
         # The script names itself.
         prog=os.environ.get('RHS_ISAC_PROGRAM', 'python3 -m rhs_isac_ros.frontend'),
-        description=__doc__,
-        formatter_class=DefaultsFormatter)
+        description=__doc__)
     commands = parser.add_subparsers(dest='command', required=True)
     for name, text in (
             ('check', 'print serial number, supply and times, and read each element back'),
             ('show', 'print the last pattern: # is 1, . is 0, seen from the front'),
             ('sweep', 'switch on one element after the other, from the lower left')):
         command = commands.add_parser(
-            name, help=text, description=text, formatter_class=parser.formatter_class)
+            name, help=text, description=text)
         command.add_argument('port', type=_port, metavar='PORT',
                              help='device such as /dev/ttyUSB0, or emulated')
         command.add_argument('--timeout', type=positive_float, default=0.1,

@@ -11,7 +11,6 @@ from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.waveguides import board_of_guides
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
-    DefaultsFormatter,
     input_file,
     nonnegative_float,
     output_file,
@@ -27,16 +26,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return the code of `exit_code_of`."""
     parser = ArgumentParser(prog='python3 -m rhs_isac_ros.model', description=__doc__)
     kinds = parser.add_subparsers(dest='kind', required=True)
-    guides = kinds.add_parser('waveguides', formatter_class=DefaultsFormatter,
-                              help='compute waveguides with coupled dipoles')
+    guides = kinds.add_parser('waveguides', help='compute waveguides with coupled dipoles')
     guides.add_argument('--scenario', '--config', type=input_file, required=True,
                         help='YAML file of the scenario; its field board is ignored')
     guides.add_argument('--loss', type=nonnegative_float, default=3.0,
                         help='loss of the guides [dB/m]')
     guides.add_argument('--across', type=positive_float, default=0.07,
                         help='position of the elements between the walls of a guide, from 0 to 1')
-    read = kinds.add_parser('touchstone', formatter_class=DefaultsFormatter,
-                            help='convert a Touchstone file; needs scikit-rf')
+    read = kinds.add_parser('touchstone', help='convert a Touchstone file; needs scikit-rf')
     read.add_argument('file', type=input_file,
                       help='Touchstone file: ports of the feeds, then those of the elements')
     read.add_argument('--feeds', type=positive_int, required=True, help='number of feeds')

@@ -98,20 +98,14 @@ class RoleStatistics:
         new_faults, self._faults = faults - self._faults, faults
         conflicts, warnings = ([text for name, text in status.items() if name.startswith(kind)]
                                for kind in ('conflict.', 'warning.'))
-        if conflicts:
-            summary = '; '.join(conflicts)
-        elif self.missing:
-            summary = f'waiting for {", ".join(self.missing)}'
-        elif blocked:
-            summary = f'blocked: {phase}'
-        elif warnings:
-            summary = '; '.join(warnings)
-        elif new_faults:
-            summary = _summary(new_faults)
-        else:
-            summary = 'paused' if phase == BsState.PAUSED.value else 'no fault'
-            return Report(False, summary, details)
-        return Report(True, summary, details)
+        # The most important one.
+        fault = ('; '.join(conflicts)
+                 or self.missing and f'waiting for {", ".join(self.missing)}'
+                 or blocked and f'blocked: {phase}'
+                 or '; '.join(warnings)
+                 or new_faults and _summary(new_faults))
+        summary = fault or ('paused' if phase == BsState.PAUSED.value else 'no fault')
+        return Report(bool(fault), summary, details)
 
     def _codebook_ids(self, in_use: str) -> dict[str, str]:
         """Return the ids of the codebook in use (or else the latest one) and of a pending one."""

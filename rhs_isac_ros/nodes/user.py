@@ -221,9 +221,13 @@ class UserNode(RoleNode[User]):
         if len(starts) not in (0, count):
             one = 'one or none' if count == 1 else f'{count}, one for each user, or none'
             raise ParameterError(f'position_m: {len(starts)} points, expected {one}')
-        if values.mobility in ('waypoints', *ROBOTS) and count > 1:
-            raise ParameterError(
-                f'user_count: {count}, expected 1 with mobility {values.mobility}')
+        if values.mobility in ('waypoints', *ROBOTS):
+            if count > 1:
+                raise ParameterError(
+                    f'user_count: {count}, expected 1 with mobility {values.mobility}')
+            if len(starts):
+                raise ParameterError(
+                    f'position_m: given, expected none with mobility {values.mobility}')
         users = {values.user_id + n: self._mobility(
             values.user_id + n, starts[n] if len(starts) else None) for n in range(count)}
         if channel := self.scenario.channel:
@@ -234,9 +238,6 @@ class UserNode(RoleNode[User]):
         """Return the mobility of a user, which starts at `position` unless this is None."""
         values = self.values
         if values.mobility in ROBOTS:
-            if position is not None:
-                raise ParameterError(
-                    f'position_m: given, expected none with mobility {values.mobility}')
             follow, source = ((follow_odometry, values.odometry_topic)
                               if values.mobility == ODOMETRY else
                               (follow_frame, values.robot_frame))
@@ -253,8 +254,6 @@ class UserNode(RoleNode[User]):
             waypoints = self._points('waypoints_m')
             if not len(waypoints):
                 raise ParameterError('waypoints_m: empty, expected x, y, z of the first point')
-            if position is not None:
-                raise ParameterError('position_m: given, expected none with mobility waypoints')
             return mobility.Waypoints(waypoints.tolist(), values.speed_mps)
         if values.mobility == 'random_walk':
             return mobility.RandomWalk(self.scenario, values.speed_mps, rng, position)

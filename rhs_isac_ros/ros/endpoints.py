@@ -112,8 +112,7 @@ def steady_timer(node: Node, period_s: float, callback: Callable[[], float | Non
 class _OfRole(Protocol):
     """A node of a role, which counts failures of plug-ins."""
 
-    def note(self, error: PluginError) -> None:
-        """Count and log a failure."""
+    def note(self, error: PluginError) -> None: ...
 
 
 @contextlib.contextmanager

@@ -17,11 +17,28 @@ from rhs_isac_ros.support.pictures import picture_format
 _Parsed = TypeVar('_Parsed')
 
 
+class _Formatter(argparse.ArgumentDefaultsHelpFormatter):
+    """A formatter that shows defaults which the help of an option does not state."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        is_stated = 'default' in (action.help or '') or any(
+            action.default is one for one in (None, False, ''))
+        return action.help if is_stated else super()._get_help_string(action)
+
+
+class HelpFormatter(_Formatter, argparse.RawDescriptionHelpFormatter):
+    """A formatter that also keeps line breaks of the description and epilog."""
+
+
 class ArgumentParser(argparse.ArgumentParser):
-    """A parser whose usage errors are one line with a hint; options cannot be abbreviated."""
+    """A parser whose usage errors are one line with a hint; options cannot be abbreviated.
+
+    The help shows the default of each option once.
+    """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **{'allow_abbrev': False, **options})
+        super().__init__(*arguments, **{
+            'allow_abbrev': False, 'formatter_class': _Formatter, **options})
 
     def parse_known_args(  # type: ignore[override]
             self, args: Sequence[str] | None = None, namespace: Any = None
@@ -40,19 +57,6 @@ class ArgumentParser(argparse.ArgumentParser):
         # An argument may contain line breaks.
         text = ' '.join(message.split())
         self.exit(2, f'{self.prog}: error: {text}; see {self.prog} --help\n')
-
-
-class DefaultsFormatter(argparse.ArgumentDefaultsHelpFormatter):
-    """A formatter that shows defaults that the help of an option does not state."""
-
-    def _get_help_string(self, action: argparse.Action) -> str | None:
-        is_stated = action.default is None or action.default is False or (
-            '(default' in (action.help or ''))
-        return action.help if is_stated else super()._get_help_string(action)
-
-
-class HelpFormatter(DefaultsFormatter, argparse.RawDescriptionHelpFormatter):
-    """A formatter that also keeps line breaks of the description and epilog."""
 
 
 def typed(parse: Callable[[str], _Parsed]) -> Callable[[str], _Parsed]:

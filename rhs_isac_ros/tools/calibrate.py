@@ -248,8 +248,7 @@ def _parser() -> argparse.ArgumentParser:
         f'{_SITE_OUTPUT}')
     add('--namespace', default='/', help='namespace of the recorded network (default: /)')
     add('--cycles', type=positive_int, default=_CYCLES, metavar='N',
-        help='pilots, or users that two surfaces locate, to collect from a running network '
-        f'(default: {_CYCLES})')
+        help='pilots, or users that two surfaces locate, to collect from a running network')
     add('--timeout', type=positive_float, default=_TIMEOUT_S, metavar='S',
         help=f'maximum time to collect the pilots (default: {_TIMEOUT_S:g} s)')
     return parser

@@ -119,12 +119,12 @@ class ViewNode(Node):
             self._write(self.view.add_track(user, *point))
 
 
-def entries(path: Path, namespace: str, scenario: Scenario, max_cycles: int = 0
+def entries(path: Path, namespace: str, scenario: Scenario, max_cycles: int | None = None
             ) -> Iterator[Entry]:
     """Yield the entries for a recording.
 
-    `max_cycles` limits the number of cycles unless it is 0. Raises RecordingError if the file is
-    invalid, has another scenario, or has no cycle in the namespace.
+    `max_cycles` limits the number of cycles. Raises RecordingError if the file is invalid, has
+    another scenario, or has no cycle in the namespace.
     """
     view = NetworkView(scenario)
     yield from view.begin()
@@ -220,7 +220,7 @@ def _parser() -> argparse.ArgumentParser:
         help='recording, or folder of ros2 bag record; by default the running network')
     add('--save', type=output_file, metavar='FILE',
         help='write a file for Rerun, *.rrd, instead of serving the viewer')
-    add('--cycles', type=positive_int, default=0, metavar='N',
+    add('--cycles', type=positive_int, metavar='N',
         help='show N cycles; the view of a running network then ends')
     add_files(parser, 'config')
     add = parser.add_argument_group('browser').add_argument

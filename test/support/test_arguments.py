@@ -8,7 +8,6 @@ import pytest
 
 from rhs_isac_ros.support.arguments import (
     ArgumentParser,
-    DefaultsFormatter,
     check_distinct,
     input_file,
     interval,
@@ -36,7 +35,7 @@ def test_ranges_of_numbers_contain_their_ends_unless_open():
 
 
 def test_help_states_each_default_once():
-    parser = ArgumentParser(formatter_class=DefaultsFormatter)
+    parser = ArgumentParser()
     parser.add_argument('--seed', default=0, help='seed')
     parser.add_argument('--jobs', default=-1, help='jobs (default: one per core)')
     parser.add_argument('--file', help='file')

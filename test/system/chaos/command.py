@@ -19,12 +19,7 @@ from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.ros.environment import check_environment, private_domain, use_discovery_profile
-from rhs_isac_ros.support.arguments import (
-    ArgumentParser,
-    DefaultsFormatter,
-    positive_float,
-    positive_int,
-)
+from rhs_isac_ros.support.arguments import ArgumentParser, positive_float, positive_int
 from rhs_isac_ros.support.exits import print_error
 from rhs_isac_ros.tools.demo import add_network_options, load_files, start_network
 from system.chaos import crashes, fuzzing, intruders, soaking
@@ -143,7 +138,7 @@ def _progress(text: str) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = ArgumentParser(
-        prog='scripts/chaos', formatter_class=DefaultsFormatter,
+        prog='scripts/chaos',
         description='Start a network of processes, kill and restart each node in each phase, '
                     'start a second node of each role, and check from outside that no invariant '
                     'of the results is violated.')
