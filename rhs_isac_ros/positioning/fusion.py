@@ -6,8 +6,8 @@ product of one sheet of every surface.
 
 The maximum of a product is found by a Gauss-Newton step from that of the sheets' moments. Weighted
 samples around it, in range and direction cosines of the surface with the thinnest sheet, yield the
-moments in the region; see `products`. Where few of them carry the weight, or where two sheets meet
-again elsewhere, the region is halved, and each half has a proposal of its own.
+moments in the region; see `products`. Where few of them carry the weight, or where they miss a
+part of the product, the region is halved, and each half has a proposal of its own.
 
 To each likelihood, a constant is added: the user may be blocked from the surface, the search may
 have missed a mode, or the surface may be elsewhere. A surface that disagrees with the others thus
@@ -36,13 +36,15 @@ from rhs_isac_ros.positioning.mixture import Mixture, log_volume, velocity_varia
 from rhs_isac_ros.positioning.products import (
     Rows,
     Term,
+    elsewhere,
     expanded,
     logarithm,
+    may_meet_again,
     prior_information,
     proposal,
 )
 from rhs_isac_ros.positioning.segments import concatenate, select
-from rhs_isac_ros.positioning.sheets import Sheets, move_inside
+from rhs_isac_ros.positioning.sheets import Inside, Sheets, move_inside
 from rhs_isac_ros.positioning.templates import standard_normal
 from rhs_isac_ros.support.recent import Recent
 from rhs_isac_ros.support.threads import one_blas_thread
@@ -351,11 +353,14 @@ class _Products(NamedTuple):
         parts = _Parts(np.flatnonzero(~single), mass.means[~single], *np.repeat(
             bounds_m[:, None], np.count_nonzero(~single), axis=1))
         for left in reversed(range(_LIMITS.halvings + 1) if len(parts.owners) else ()):
-            samples = parts.sampled(found.select(parts.owners), factors, bounds_m)
-            inside = _moments(samples.positions, samples.logs)
+            samples = parts.sampled(found.select(parts.owners), factors)
+            inside = _moments(samples.positions, samples.logs).weighted(
+                parts.log_shares(bounds_m))
             best = max(inside.log_weights.max(), moments.log_weights.max(initial=-np.inf))
-            poor = (inside.log_weights >= best - _LIMITS.margin) & (np.isfinite(
-                samples.beyond[:, 0]) | (_effective(samples.logs) < _LIMITS.effective))
+            heavy = inside.log_weights >= best - _LIMITS.margin
+            beyond = parts.beyond(samples, heavy)
+            poor = np.isfinite(beyond[:, 0]) | heavy & (
+                _effective(samples.logs) < _LIMITS.effective)
             order = np.argsort(-np.where(poor, inside.log_weights, -np.inf), kind='stable')
             halved = order[:min(np.count_nonzero(poor), _LIMITS.parts)] if left else order[:0]
             kept = np.delete(np.arange(len(poor)), halved)
@@ -363,7 +368,8 @@ class _Products(NamedTuple):
             moments = concatenate(moments, select(inside, kept))
             if not len(halved):
                 break
-            parts = select(parts, halved).halved(select(samples, halved))
+            parts = select(parts, halved).halved(
+                samples.positions[halved], samples.logs[halved], beyond[halved])
         kept = np.flatnonzero(_has_mass(moments))
         names, groups = np.unique(owners[kept], return_inverse=True)
         return _Products(found.rows[names], select(moments, kept)._merged(groups))
@@ -396,8 +402,9 @@ class _Samples(NamedTuple):
     """Samples of P parts, S each."""
 
     positions: np.ndarray  # Float64 [P, S, 3] [m].
-    logs: np.ndarray  # Logarithms of weights for averages over the region, float64 [P, S].
-    beyond: np.ndarray  # Of `proposal`, float64 [P, 3] [m]; NaN if there is none.
+    logs: np.ndarray  # Logarithms of weights for averages over the boxes, float64 [P, S].
+    # Indices of parts, and the factors and Gaussians of their products.
+    groups: list[tuple[np.ndarray, list[Term], Inside]]
 
 
 class _Parts(NamedTuple):
@@ -408,25 +415,44 @@ class _Parts(NamedTuple):
     low_m: np.ndarray  # Corners of the boxes, float64 [P, 3].
     high_m: np.ndarray
 
-    def sampled(self, products: _Products, factors: Sequence[_Factor], bounds_m: np.ndarray
-                ) -> _Samples:
+    def log_shares(self, bounds_m: np.ndarray) -> np.ndarray:
+        """Return the logarithms of the shares of the boxes in the region, [P]."""
+        size = np.ptp(bounds_m, axis=0)
+        shares: np.ndarray = np.log(
+            (self.high_m - self.low_m)[:, size > 0] / size[size > 0]).sum(axis=1)
+        return shares
+
+    def sampled(self, products: _Products, factors: Sequence[_Factor]) -> _Samples:
         """Draw samples of products in the boxes."""
         n = int(np.clip(_LIMITS.samples // len(self.owners), *_LIMITS.of_product))
         normal = standard_normal(1 << (n.bit_length() - 1))
         positions = np.empty((len(self.owners), *normal.shape))
-        logs, beyond = np.empty(positions.shape[:2]), np.empty_like(self.starts_m)
+        logs, groups = np.empty(positions.shape[:2]), []
         for mine, terms in products._by_reference(factors):
-            gaussians, beyond[mine] = proposal(
-                terms, self.starts_m[mine], np.stack([self.low_m[mine], self.high_m[mine]]))
+            gaussians = proposal(terms, self.starts_m[mine], self._boxes(mine))
+            groups.append((mine, terms, gaussians))
             positions[mine], logs[mine] = gaussians.sample(normal)
             logs[mine] += logarithm(terms, positions[mine])
-        size = np.ptp(bounds_m, axis=0)
-        shares = (self.high_m - self.low_m)[:, size > 0] / size[size > 0]
-        return _Samples(positions, logs + np.log(shares).sum(axis=1)[:, None], beyond)
+        return _Samples(positions, logs, groups)
 
-    def halved(self, samples: _Samples) -> '_Parts':
-        """Halve boxes in front of `beyond`, or among the samples, where these are widest."""
-        rows, (positions, logs, beyond) = np.arange(len(self.owners)), samples
+    def beyond(self, samples: _Samples, chosen: np.ndarray) -> np.ndarray:
+        """Return places of `elsewhere` for chosen parts, float64 [P, 3] [m]; NaN for others."""
+        found = np.full_like(self.starts_m, np.nan)
+        for mine, terms, gaussians in samples.groups:
+            rows = np.flatnonzero(chosen[mine] & may_meet_again(
+                terms, gaussians, self._boxes(mine)))
+            if len(rows):
+                found[mine[rows]] = elsewhere(
+                    [Term(one.pose, select(one.rows, rows)) for one in terms],
+                    gaussians.rows(rows), samples.logs[mine[rows]], self._boxes(mine[rows]))
+        return found
+
+    def _boxes(self, chosen: np.ndarray) -> np.ndarray:
+        return np.stack([self.low_m[chosen], self.high_m[chosen]])
+
+    def halved(self, positions: np.ndarray, logs: np.ndarray, beyond: np.ndarray) -> '_Parts':
+        """Halve boxes in front of places beyond, or among the samples, where these are widest."""
+        rows = np.arange(len(self.owners))
         apart, best = np.isfinite(beyond[:, 0]), positions[rows, np.argmax(logs, axis=1)]
         axis = np.argmax(np.where(
             apart[:, None], np.abs(beyond - best), positions.std(axis=1)), axis=1)

@@ -4,7 +4,8 @@ A sheet is a Gaussian in range and direction cosines of its surface. Around each
 logarithm of a product has a gradient and a curvature. Two sheets of opposite curvature that touch
 have a product along a rim, which may be far from the maximum. A Gaussian is thus as wide as if the
 other sheets were thicker by what they bend over it. Three thin sheets meet in a point, over which
-none of them bends.
+none of them bends. Sheets may meet at several places, such as two circles in a plane; ascents from
+all over the first sheet find those that a Gaussian does not contain.
 """
 
 import functools
@@ -16,7 +17,9 @@ import numpy as np
 from rhs_isac_ros.model.gaussian import step_to_maximum, symmetric
 from rhs_isac_ros.model.geometry import jacobian, polar_derivative, to_polar, to_positions
 from rhs_isac_ros.model.pose import Pose
+from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.sheets import Inside, log_values
+from rhs_isac_ros.positioning.templates import standard_normal
 
 
 class _Limits(NamedTuple):
@@ -34,12 +37,17 @@ class _Limits(NamedTuple):
     # the information after which there is no further one.
     passes: int = 5
     settled: float = 1.5
-    # Largest distance of another place where two sheets meet, in standard deviations of the first
-    # one, and smallest distance of the sheets between both places, in those of the second one.
-    reach: float = 3.5
-    apart: float = 2.0
-    # Share of the way to this place that has to be inside the part of the region.
-    within: float = 0.75
+    # Sheets may meet again if one slopes over the standard deviations of another by less than this
+    # many times what they bend.
+    reach: float = 6.0
+    # Number of ascents from the first sheet, which is wider by a factor, and their steps.
+    starts: int = 16
+    wider: float = 1.7
+    steps: int = 4
+    # Logarithms: smallest excess of a weight over those of all samples, and largest decrease of
+    # the product, at a place that samples miss.
+    excess: float = 1.0
+    decrease: float = 8.0
 
 
 _LIMITS = _Limits()
@@ -106,26 +114,24 @@ def expanded(terms: Sequence[Term], positions: np.ndarray, prior: np.ndarray
             symmetric(transposed @ (curvature + prior) @ by_point))
 
 
-def proposal(terms: Sequence[Term], positions: np.ndarray, bounds_m: np.ndarray
-             ) -> tuple[Inside, np.ndarray]:
-    """Return Gaussians that are as wide as products around positions [T, 3] [m], and `beyond`.
+def proposal(terms: Sequence[Term], positions: np.ndarray, bounds_m: np.ndarray) -> Inside:
+    """Return Gaussians that are as wide as products around positions [T, 3] [m].
 
     In (r, u, v) of the first surface, the sheets of the others are curved. Over the Gaussian, they
     are thicker by the second differences of their coordinates. The first Gaussian is that of the
     first sheet. The product with the others may be much smaller. Over its Gaussian, sheets bend
-    less. A sheet may meet that of the first surface again, `beyond` a place where both are apart,
-    [T, 3] [m]; NaN where none does.
+    less.
     """
     (pose, first), *others = terms
     prior, centre = prior_information(bounds_m), bounds_m.mean(axis=0)
-    positions, beyond = _on_line(terms[0], np.clip(positions, *bounds_m), bounds_m)
+    positions = np.clip(positions, *bounds_m)
     points = to_polar(pose.to_surface(positions))
     by_point = pose.rotation @ jacobian(points)
     # The centre and the width of the sheet in the region.
     by_site = by_point.swapaxes(1, 2) @ prior
     total = symmetric(first.curvature + by_site @ by_point)
     step = step_to_maximum(total, (by_site @ (centre - positions)[..., None])[..., 0])
-    for number in range(_LIMITS.passes):
+    for _ in range(_LIMITS.passes):
         positions = np.clip(pose.to_site(to_positions(points + step)), *bounds_m)
         points = to_polar(pose.to_surface(positions))
         by_point = pose.rotation @ jacobian(points)
@@ -138,15 +144,6 @@ def proposal(terms: Sequence[Term], positions: np.ndarray, bounds_m: np.ndarray
             here = to_polar(other.to_surface(positions))
             change = to_polar(other.to_surface(around)) - here[:, None]
             second = (change[:, :3] + change[:, 3:]) / _LIMITS.step**2
-            if not number:
-                slopes = (change[:, :3, 0] - change[:, 3:, 0]) / (2 * _LIMITS.step)
-                turns, chosen = _turns(slopes, second[:, :, 0], rows)
-                places = pose.to_site(to_positions(
-                    points + axes[chosen] * turns[:, None] / _LIMITS.step))
-                nearest = np.clip(places, *bounds_m)
-                found = (np.linalg.norm(nearest - positions, axis=1)
-                         > _LIMITS.within * np.linalg.norm(places - positions, axis=1))
-                beyond[found] = nearest[found]
             thicker = _LIMITS.tails**2 * (
                 np.sum(second**2, axis=1) / 2 + np.sum(second, axis=1)**2 / 4)
             information = rows.is_sheet[:, None, None] * np.linalg.inv(
@@ -161,38 +158,51 @@ def proposal(terms: Sequence[Term], positions: np.ndarray, bounds_m: np.ndarray
             break
         step = step_to_maximum(total, gradient)
     wide = 1 / _LIMITS.spread**2
-    return Inside.of(
-        points, wide * gradient, wide * symmetric(curvature), bounds_m, pose), beyond
+    return Inside.of(points, wide * gradient, wide * symmetric(curvature), bounds_m, pose)
 
 
-def _on_line(term: Term, positions: np.ndarray, bounds_m: np.ndarray
-             ) -> tuple[np.ndarray, np.ndarray]:
-    """Move positions [T, 3] [m] in a box that is a line to the sheet, which it meets twice.
+def may_meet_again(terms: Sequence[Term], gaussians: Inside, bounds_m: np.ndarray) -> np.ndarray:
+    """Mark products whose sheets may also meet elsewhere in the boxes, bool [T]."""
+    (pose, first), *others = terms
+    points = gaussians.points
+    positions, by_point = pose.to_site(to_positions(points)), pose.rotation @ jacobian(points)
+    prior = prior_information(bounds_m)
+    total = first.curvature + by_point.swapaxes(1, 2) @ prior @ by_point
+    roots = by_point[:, :, 1:] @ np.linalg.cholesky(np.linalg.inv(total)[:, 1:, 1:])
+    width_m2, found = np.sum(roots**2, axis=(1, 2)), np.zeros(len(points), bool)
+    for other, rows in others:
+        sight = positions - other.origin
+        range_m = np.linalg.norm(sight, axis=1)
+        slope_m = np.linalg.norm((sight[:, None] @ roots)[:, 0], axis=1) / range_m
+        bend_m = width_m2 * (1 / points[:, 0] + 1 / range_m)
+        found |= rows.is_sheet & (slope_m < _LIMITS.reach * bend_m)
+    return found
 
-    Returns them and the other places; NaN where these are outside of the box, or if it is no line.
+
+def elsewhere(terms: Sequence[Term], gaussians: Inside, log_weights: np.ndarray,
+              bounds_m: np.ndarray) -> np.ndarray:
+    """Return places in boxes that samples of Gaussians miss, float64 [T, 3] [m]; NaN if none.
+
+    There, the product is not much smaller than at the best place, and a sample would weigh more
+    than all S samples, which have the given weights, [T, S]. Ascents start at places all over the
+    first sheet.
     """
-    others = np.full_like(positions, np.nan)
-    (free,) = np.nonzero((bounds_m[1] > bounds_m[0]).any(axis=0))
-    if len(free) == 1:
-        sight = positions - term.pose.origin
-        along_m2 = term.rows.points[:, 0]**2 - np.sum(np.delete(sight, free, axis=1)**2, axis=1)
-        along_m = np.copysign(np.sqrt(np.maximum(along_m2, 0.0))[:, None], sight[:, free])
-        mirrored = positions.copy()
-        positions[:, free], mirrored[:, free] = term.pose.origin[free] + [along_m, -along_m]
-        found = np.all((mirrored >= bounds_m[0]) & (mirrored <= bounds_m[1]), axis=1)
-        others[found] = mirrored[found]
-    return positions, others
-
-
-def _turns(slopes: np.ndarray, second: np.ndarray, rows: Rows
-           ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return the farthest places at which ranges are the same again, [T], and their axes.
-
-    Takes the derivatives of the ranges along the axes of the first sheet, [T, 3]. Places are in
-    standard deviations of it; NaN if the sheet does not leave that of `rows` in between.
-    """
-    turns = -2 * slopes / np.where(second == 0, np.inf, second)
-    apart = np.abs(slopes * turns) / 4 / np.sqrt(rows.covariances[:, :1, 0])
-    apart[(np.abs(turns) > _LIMITS.reach) | ~rows.is_sheet[:, None]] = 0.0
-    chosen = np.arange(len(turns)), np.argmax(apart, axis=1)
-    return np.where(apart[chosen] > _LIMITS.apart, turns[chosen], np.nan), chosen
+    pose, rows = terms[0].pose, terms[0].rows
+    near, curvature = gaussians.points, rows.curvature / _LIMITS.wider**2
+    gradient = (curvature @ (rows.points - near)[..., None])[..., 0]
+    starts, _ = Inside.of(near, gradient, curvature, bounds_m, pose).sample(
+        standard_normal(_LIMITS.starts))
+    each = np.repeat(np.arange(len(starts)), _LIMITS.starts)
+    repeated = [Term(one.pose, select(one.rows, each)) for one in terms]
+    boxes = bounds_m[:, each]
+    prior, path = prior_information(boxes), [starts.reshape(-1, 3)]
+    for _ in range(_LIMITS.steps):
+        points, gradient, total = expanded(repeated, path[-1], prior)
+        path.append(np.clip(pose.to_site(to_positions(
+            points + step_to_maximum(total, gradient))), *boxes))
+    places = np.concatenate([one.reshape(starts.shape) for one in path], axis=1)
+    values = logarithm(terms, places)
+    excess = values + gaussians.log_ratio(places) - log_weights.max(axis=1, keepdims=True)
+    excess[values < values.max(axis=1, keepdims=True) - _LIMITS.decrease] = -np.inf
+    chosen = np.arange(len(places)), np.argmax(excess, axis=1)
+    return np.where((excess[chosen] > _LIMITS.excess)[:, None], places[chosen], np.nan)

@@ -349,16 +349,41 @@ class Inside(NamedTuple):
             np.add(log_ratio, ratio, out=log_ratio)
             return mean + std * deviations
 
-        sides = None
-        if (two_sided := self._is_two_sided()).any():
-            # Half of the samples are on either side of the last axis' zero.
-            sides = np.zeros((len(two_sided), len(normal)))
-            sides[two_sided] = np.where(np.arange(len(normal)) < len(normal) // 2, 1.0, -1.0)
-            low_m, high_m = self._side_limits(sides)
-            share = (high_m - low_m)[two_sided] / (self.high_m - self.low_m)[two_sided, 2:]
-            log_ratio[two_sided] = np.log(2 * share)
+        # Half of the samples are on either side of the last axis' zero.
+        sides = self._sides(np.where(np.arange(len(normal)) < len(normal) // 2, 1.0, -1.0))
         positions = self._positions(truncated, len(normal), sides)
-        return positions.transpose(1, 2, 0) + self.pose.origin, log_ratio
+        return (positions.transpose(1, 2, 0) + self.pose.origin,
+                log_ratio + self._log_share(sides))
+
+    def log_ratio(self, positions: np.ndarray) -> np.ndarray:
+        """Return the second result of `sample` at positions [M, S, 3] [m] in the region."""
+        places = (positions - self.pose.origin).transpose(2, 0, 1)
+        places = places[self.order.T, np.arange(len(positions))]
+        log_ratio = np.zeros(places.shape[1:])
+
+        def given(axis: int, mean: np.ndarray, std: np.ndarray, low: np.ndarray,
+                  high: np.ndarray) -> np.ndarray:
+            cut = _Cut.of((low - mean) / std, (high - mean) / std)
+            np.add(log_ratio, cut.log_ratio((places[axis] - mean) / std), out=log_ratio)
+            return places[axis]
+
+        sides = self._sides(np.copysign(1.0, places[2]) * np.copysign(1.0, self.direction[:, 2:]))
+        self._positions(given, places.shape[2], sides)
+        return log_ratio + self._log_share(sides)
+
+    def _sides(self, sides: np.ndarray) -> np.ndarray | None:
+        """Return the sides of samples, [S] or [M, S], 0 where there is one; or None."""
+        two_sided = self._is_two_sided()
+        return np.where(two_sided[:, None], sides, 0.0) if two_sided.any() else None
+
+    def _log_share(self, sides: np.ndarray | None) -> np.ndarray | float:
+        """Return the logarithms of twice the shares of the sides in the last axis, [M, S]."""
+        if sides is None:
+            return 0.0
+        low, high = self._side_limits(sides)
+        shares = np.divide(high - low, (self.high_m - self.low_m)[:, 2:],
+                           out=np.full(sides.shape, 0.5), where=sides != 0)
+        return np.log(2 * shares)
 
     def _is_two_sided(self) -> np.ndarray:
         """Mark Gaussians with samples on either side of the last axis' zero, bool [M].
@@ -517,6 +542,41 @@ def move_inside(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray,
     return moved
 
 
+class _Cut(NamedTuple):
+    """A normal density, restricted to intervals [M, 1] or [M, S].
+
+    It is mirrored so that the lower tail of the distribution function, which is accurate, counts.
+    """
+
+    sign: np.ndarray  # -1 where it is mirrored.
+    shift: np.ndarray  # By which the interval is moved towards the maximum.
+    share: np.ndarray  # Of the density below the interval.
+    between: np.ndarray  # Share of the density in the interval.
+    log_density: np.ndarray  # Logarithm of its average in the interval.
+
+    @classmethod
+    def of(cls, low: np.ndarray, high: np.ndarray) -> '_Cut':
+        """Restrict it to the intervals between these limits."""
+        from scipy.special import ndtr
+
+        width, sign = high - low, np.where(low + high > 0, -1.0, 1.0)
+        left, right = np.where(sign < 0, (-high, -low), (low, high))
+        shift = np.minimum(right + _LIMITS.deviation, 0.0)
+        left, right = left - shift, right - shift
+        share = ndtr(left)
+        between = ndtr(right) - share
+        centre = np.exp(-(left + right)**2 / 8) / np.sqrt(2 * np.pi)
+        least = _LIMITS.constant
+        return cls(sign, shift, share, between, np.log(np.where(
+            width > least, between / np.maximum(width, least), centre)))
+
+    def log_ratio(self, deviations: np.ndarray) -> np.ndarray:
+        """Return the logarithm of a uniform density relative to this one, [M, S]."""
+        ratio: np.ndarray = (self.log_density + np.log(2 * np.pi) / 2
+                             + (self.sign * deviations - self.shift)**2 / 2)
+        return ratio
+
+
 def _truncated(normal: np.ndarray, low: np.ndarray, high: np.ndarray
                ) -> tuple[np.ndarray, np.ndarray]:
     """Restrict points of a normal density [S] to intervals [M, 1] or [M, S].
@@ -526,22 +586,12 @@ def _truncated(normal: np.ndarray, low: np.ndarray, high: np.ndarray
     from scipy.special import ndtr, ndtri
 
     deviations = np.repeat(normal[None], len(low), axis=0)
-    width = high - low
-    cut = (low.max(axis=1) > -_LIMITS.distant) | (high.min(axis=1) < _LIMITS.distant)
-    ratio = normal**2 / 2 - np.log(np.where(cut[:, None], 1.0, width))
-    if cut.any():
-        low, high, width = low[cut], high[cut], width[cut]
-        # The lower tail of the distribution function is accurate.
-        sign = np.where(low + high > 0, -1.0, 1.0)
-        left, right = np.where(sign < 0, (-high, -low), (low, high))
-        shift = np.minimum(right + _LIMITS.deviation, 0.0)
-        left, right = left - shift, right - shift
-        share = ndtr(left)
-        between = ndtr(right) - share
-        value = ndtri(share + between * np.where(sign < 0, ndtr(-normal), ndtr(normal)))
-        centre = np.exp(-(left + right)**2 / 8) / np.sqrt(2 * np.pi)
-        least = _LIMITS.constant
-        density = np.where(width > least, between / np.maximum(width, least), centre)
-        deviations[cut] = sign * (value + shift)
-        ratio[cut] = value**2 / 2 + np.log(density)
-    return deviations, ratio + np.log(2 * np.pi) / 2
+    wide = (low.max(axis=1) <= -_LIMITS.distant) & (high.min(axis=1) >= _LIMITS.distant)
+    ratio = normal**2 / 2 - np.log(np.where(wide[:, None], high - low, 1.0)) + np.log(
+        2 * np.pi) / 2
+    if not wide.all():
+        cut = _Cut.of(low[~wide], high[~wide])
+        value = cut.sign * (cut.shift + ndtri(cut.share + cut.between * np.where(
+            cut.sign < 0, ndtr(-normal), ndtr(normal))))
+        deviations[~wide], ratio[~wide] = value, cut.log_ratio(value)
+    return deviations, ratio

@@ -228,6 +228,25 @@ def test_a_region_without_height_keeps_its_height():
     assert covariance[2, 2] < 0.005**2
 
 
+def test_arcs_of_nearly_one_circle_meet_along_a_crescent():
+    """In a plane across, surfaces side by side see such arcs."""
+    half, std = np.radians(2.5), np.array([0.05, 0.3, 0.3])
+    turned = Pose(tuple(10.0 * np.array([1 - np.cos(2 * half), -np.sin(2 * half), 0.0])),
+                  (0.0, 0.0, np.sin(half), np.cos(half)), EXACT)
+    plane = np.array([[9.0, -5.0, -2.0], [9.0, 5.0, 2.0]])
+    sightings = [sheets(pose, [9.0, 1.5, 1.0], std=std) for pose in (FRONT, turned)]
+    y, z = (one.ravel() for one in np.meshgrid(*np.linspace(plane[0, 1:], plane[1, 1:], 400).T))
+    positions = np.column_stack([0 * y + 9.0, y, z])
+    weights = np.exp(sum(log_likelihood(one, positions, std) for one in sightings))
+    weights /= weights.sum()
+    mean = weights @ positions
+    deviation = np.sqrt(weights @ (positions - mean)**2)[1:]
+    fused = fuse(sightings, plane)
+    np.testing.assert_allclose((fused.mean - mean)[1:] / deviation, 0.0, atol=0.1)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(fused.covariance))[1:] / deviation, 1.0, atol=0.1)
+
+
 def test_a_line_meets_two_sheets_on_either_side():
     """Seen values of a line across: surfaces that face each other see both sides alike."""
     std, x, z = np.array([0.05, 0.3, 0.3]), 6.718, 0.208

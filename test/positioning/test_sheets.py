@@ -59,7 +59,9 @@ def test_samples_have_the_moments_and_the_mass_of_the_gaussian_in_the_region(ext
     rng = np.random.default_rng(3)
     for inside in rng.uniform(*bounds, (2, 3)):
         centre = to_polar(inside) + shift
-        positions, log_weights = restricted(centre, bounds).sample(NORMAL)
+        gaussian = restricted(centre, bounds)
+        positions, log_weights = gaussian.sample(NORMAL)
+        np.testing.assert_allclose(gaussian.log_ratio(positions), log_weights, atol=1e-4)
         weights = np.exp(log_weights[0] + log_density(positions[0], centre))
         expected = np.exp(log_density(reference, centre))
         assert ((positions >= bounds[0]) & (positions <= bounds[1])).all()
@@ -111,8 +113,9 @@ def test_a_gaussian_without_direction_reaches_both_sides_of_a_line(extents, side
     bounds = bounds_of(extents, np.array([10.0, 1.0, 0.2]))
     inside = np.array([10.0, 1.0, 0.7 * side])
     point, curvature = to_polar(inside), np.diag([1e6, 3e2, 1e-2])
-    positions, log_weights = Inside.of(
-        point[None], np.zeros((1, 3)), curvature[None], bounds).sample(NORMAL)
+    gaussian = Inside.of(point[None], np.zeros((1, 3)), curvature[None], bounds)
+    positions, log_weights = gaussian.sample(NORMAL)
+    np.testing.assert_allclose(gaussian.log_ratio(positions), log_weights, atol=1e-4)
     reference = grid(bounds)
     expected = np.exp(-likelihood_loss(to_polar(reference) - point, curvature[None]))
     weights = np.exp(log_weights[0] - likelihood_loss(

@@ -145,13 +145,12 @@ def test_a_cycle_with_all_surfaces_is_fused_at_once(fusion, site, answer):
     first, (estimate, posterior) = at_once(fusion, [answer('side'), answer('front')])
     assert first == []
     expected = fuse([sighting_of(answer(name)) for name in ('front', 'side')], site.bounds_m)
-    mean, covariance = expected.mixture.moments()
-    assert np.array_equal(estimate.position, mean)
-    assert np.array_equal(estimate.covariance_m2, covariance)
+    assert np.array_equal(estimate.position, expected.mean)
+    assert np.array_equal(estimate.covariance_m2, expected.covariance)
     assert (estimate.cycle_id, estimate.user, estimate.user_instance, estimate.stamp_ns,
             estimate.estimator, estimate.latency_s) == (1, 2, 7, 9, 'fusion of front, side', 1)
     assert 0 < estimate.outside_probability < 1e-3
-    assert np.linalg.norm(mean - PLACE) < 0.1
+    assert np.linalg.norm(expected.mean - PLACE) < 0.1
     for message in (estimate, posterior):
         m.check(message, site.surfaces['front'].scenario)
 
