@@ -45,6 +45,8 @@ class _Ascent(NamedTuple):
     steps: int = 8
     # A mode has converged when its last step changed the log-likelihood by less.
     gain: float = 0.05
+    # Share of the latest step by which the next one turns back, above which it is shortened.
+    turn: float = 0.5
 
 
 _ASCENT = _Ascent()
@@ -229,6 +231,8 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
         changed = modes.shots[moving]
         moved, new_gain = step(select(modes, moving).starts())
         reached = moved.log_likelihood - new_gain
+        _shorten(moved, new_gain, select(modes, moving), select(origins, moving),
+                 likelihood.resolution.bounds_m)
         too_long = reached < known[moving] - _ASCENT.gain
         short, long = moving[~too_long], moving[too_long]
         origins.points[short], origins.values[short] = modes.points[short], modes.values[short]
@@ -246,6 +250,28 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
         gain[moving] = 0.0
         modes = select(modes, _prune(likelihood, modes, gain, margin, modes.shots[moving]))
     return modes
+
+
+def _shorten(moved: Modes, gain: np.ndarray, modes: Modes, origins: Starts,
+             bounds_m: np.ndarray) -> None:
+    """Shorten steps from the modes to those moved, if the steps to the modes were too long.
+
+    Expected information may be below the curvature, so that each step turns back. Along the latest
+    step, the change of the gradient shows the curvature.
+    """
+    before, step = modes.points - origins.points, moved.points - modes.points
+    slopes = np.matmul(moved.curvature, before[..., None])[..., 0]
+    back = -np.sum(step * slopes, axis=1) / np.maximum(
+        np.sum(before * slopes, axis=1), np.finfo(float).tiny)
+    (turned,) = np.nonzero(back > _ASCENT.turn)
+    if len(turned):
+        left = 1 - 1 / (1 + np.minimum(back[turned], 1.0))
+        points = moved.points[turned] - left[:, None] * step[turned]
+        moved.points[turned] = to_polar(np.clip(to_positions(points), *bounds_m))
+        moved.values[turned] -= left[:, None] * (moved.values - modes.values)[turned]
+        moved.log_likelihood[turned] -= left * gain[turned]
+        moved.residual[turned] += left * gain[turned]
+        gain[turned] *= 1 - left
 
 
 def _halve(modes: Modes, origins: Starts, gain: np.ndarray, rows: np.ndarray) -> None:
