@@ -24,11 +24,16 @@ Waves: TypeAlias = tuple[np.ndarray, np.ndarray, list[np.ndarray]]
 # Number of unit phasors in the table of `_phasors`.
 _N_PHASORS = 512
 _TABLE = np.exp(2j * np.pi * np.arange(_N_PHASORS) / _N_PHASORS)
+# Elements of the surface, as an index; by default, all.
+_Elements: TypeAlias = slice | list[int]
+_ALL = slice(None)
 
 
-def los_gain(scenario: Scenario, positions: np.ndarray, band: int) -> np.ndarray:
+def los_gain(scenario: Scenario, positions: np.ndarray, band: int, elements: _Elements = _ALL
+             ) -> np.ndarray:
     """Compute the line-of-sight gains h^LoS, complex128 [N, N_SB, N_E], defined below Eq. (1)."""
-    gain, _, _ = los_waves(scenario, checked_positions(positions), [band], slopes=False)
+    gain, _, _ = los_waves(
+        scenario, checked_positions(positions), [band], elements, slopes=False)
     return _positions_first(scenario, band, gain[0])
 
 
@@ -78,23 +83,25 @@ def los_sums(scenario: Scenario, positions: np.ndarray, bands: Sequence[int],
 
 
 def los_and_derivative(
-        scenario: Scenario, positions: np.ndarray, band: int) -> tuple[np.ndarray, np.ndarray]:
+        scenario: Scenario, positions: np.ndarray, band: int, elements: _Elements = _ALL
+        ) -> tuple[np.ndarray, np.ndarray]:
     """Compute `los_gain` and its derivative, complex128 [N, 3, N_SB, N_E] [1/m].
 
     The derivative is the H-dot of Eq. (13): dh/dp_u = h (-i 2 pi f / v_0 - 1 / d) (p - p_m)_u / d.
     A gain pattern adds a term for the change of the gain with the angle from the boresight.
     """
     positions = checked_positions(positions)
-    *parts, boresight_terms = los_waves(scenario, positions, [band])
+    *parts, boresight_terms = los_waves(scenario, positions, [band], elements)
     gain, radial = (_positions_first(scenario, band, part[0]) for part in parts)
-    derivative = radial[:, None] * np.moveaxis(_offsets(scenario, positions), 2, 1)[:, :, None]
+    derivative = radial[:, None] * np.moveaxis(
+        _offsets(scenario, positions, elements), 2, 1)[:, :, None]
     for axis, term in zip(boresight_axes(scenario), boresight_terms, strict=True):
         derivative[:, axis] += _positions_first(scenario, band, term[0])
     return gain, derivative
 
 
 def frame_gains(scenario: Scenario, states: np.ndarray, by_unknown: np.ndarray,
-                elements: slice | list[int] = slice(None)) -> np.ndarray:
+                elements: _Elements = _ALL) -> np.ndarray:
     """Compute the gains of elements in the frames of a cycle, and their derivatives.
 
     Takes states of users, float64 [N, 3] [m] or [N, 6] [m, m/s], and their derivatives with
@@ -111,17 +118,15 @@ def frame_gains(scenario: Scenario, states: np.ndarray, by_unknown: np.ndarray,
         moved = np.vstack([np.eye(3), time_s * np.eye(3)])[:states.shape[1]]
         places, of_frame = states @ moved, found[:, :, band, :, frame]
         if not n_unknowns:
-            of_frame[:, 0] = los_gain(scenario, places, band)[..., elements]
+            of_frame[:, 0] = los_gain(scenario, places, band, elements)
             continue
-        gain, slope = los_and_derivative(scenario, places, band)
-        of_frame[:, 0] = gain[..., elements]
-        of_frame[:, 1:] = np.einsum(
-            'nxu,nxjm->nujm', np.matmul(moved.T, by_unknown), slope[..., elements])
+        of_frame[:, 0], slope = los_and_derivative(scenario, places, band, elements)
+        of_frame[:, 1:] = np.einsum('nxu,nxjm->nujm', np.matmul(moved.T, by_unknown), slope)
     return found
 
 
-def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int], *,
-              slopes: bool = True) -> Waves:
+def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int],
+              elements: _Elements = _ALL, *, slopes: bool = True) -> Waves:
     """Compute h^LoS times the frequency, and factors of its derivative.
 
     The derivative with respect to the user's position p is dh/dp = a (p - p_m) + b. The vector b
@@ -130,13 +135,13 @@ def los_waves(scenario: Scenario, positions: np.ndarray, bands: Sequence[int], *
     components of b along `boresight_axes`.
     Without `slopes`, the gain is repeated in place of a, and there are no terms.
     """
-    elements = geometry.element_positions(scenario)
+    places = geometry.element_positions(scenario)[elements]
     distances = np.sqrt(sum(
-        (positions[:, axis, None] - elements[:, axis])**2 for axis in range(3)))
+        (positions[:, axis, None] - places[:, axis])**2 for axis in range(3)))
     inverse, turn = 1 / distances, -2 * np.pi / SPEED_OF_LIGHT_MPS * distances
     # Sub-bands are equally spaced: two phasors and a running product replace N_SB phasors.
     step = _phasors(turn * scenario.spacing_hz) if scenario.n_subbands > 1 else turn
-    boresights = _boresights(scenario, positions)
+    boresights = _boresights(scenario, positions, elements)
     amplitude = inverse * _amplitude(scenario, boresights)
 
     def over_subbands(first: np.ndarray) -> np.ndarray:
@@ -183,9 +188,9 @@ def _positions_first(scenario: Scenario, band: int, waves: np.ndarray) -> np.nda
     return np.divide(np.moveaxis(waves, 0, 1), frequencies_hz[:, None], order='C')
 
 
-def _offsets(scenario: Scenario, positions: np.ndarray) -> np.ndarray:
-    """Return the vectors from every element to the user, float64 [N, N_E, 3] [m]."""
-    return positions[:, None, :] - geometry.element_positions(scenario)
+def _offsets(scenario: Scenario, positions: np.ndarray, elements: _Elements) -> np.ndarray:
+    """Return the vectors from elements to the user, float64 [N, N_E, 3] [m]."""
+    return positions[:, None, :] - geometry.element_positions(scenario)[elements]
 
 
 class _Boresight(NamedTuple):
@@ -197,16 +202,18 @@ class _Boresight(NamedTuple):
     gains: tuple[str, ...]  # Names of fields of the scenario.
 
 
-def _boresights(scenario: Scenario, positions: np.ndarray) -> list[_Boresight]:
+def _boresights(scenario: Scenario, positions: np.ndarray, elements: _Elements
+                ) -> list[_Boresight]:
     """Return the boresights that have gain patterns; the user's one is parallel to x."""
     gains = 'element_gain', 'user_gain'
-    normals = None if scenario.element_normals is None else geometry.element_normals(scenario)
+    normals = None if scenario.element_normals is None else geometry.element_normals(
+        scenario)[elements]
     found: list[_Boresight] = []
     for facing, names in [(None, gains)] if normals is None else [
             (normals, gains[:1]), (None, gains[1:])]:
         if not any(isinstance(getattr(scenario, name), GainPattern) for name in names):
             continue
-        offsets = _offsets(scenario, positions)
+        offsets = _offsets(scenario, positions, elements)
         along_m, across_m = offsets[..., 0], np.hypot(offsets[..., 1], offsets[..., 2])
         if facing is not None:
             along_m = np.sum(offsets * facing, axis=-1)

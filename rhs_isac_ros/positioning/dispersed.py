@@ -87,13 +87,16 @@ class DispersedLikelihood(Conditional):
         """Return the likelihood at points; see `Conditional.at`."""
         users, by_unknown = self._base.nuisance.states(points, values, moves, turns)
         positions = users[:, :3]
-        intact = self._intact.covariance_at(positions)
+        # Without errors, an intact surface has the same covariance at all points.
+        intact = self._intact.covariance_at(
+            positions[:1] if self._intact.elements.is_exact else positions)
         excess = (self._average.covariance_at(positions) - intact if any(self._scales)
                   else np.zeros(1))
         states = []
         for scale, offset, information in zip(
                 self._scales, self._offsets, self._information, strict=True):
-            factors = Factors.of(self._base.nuisance, intact + scale * excess)
+            factors = Factors.of(
+                self._base.nuisance, intact + scale * excess if scale else intact)
             states.append((factors, offset - factors.log_det, information))
         mean, slopes = self._average.mean_and_jacobian(users, by_unknown)
         return LocatedStates(self._base.nuisance, mean, slopes, slopes[:, :0], states)

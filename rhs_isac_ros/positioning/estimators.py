@@ -373,8 +373,8 @@ class SearchEstimator(abc.ABC):
         fits = {shot: _Searched(fit) for shot, fit in drawn.items()}
         if len(starts.shots):
             modes = self._in_noise(scope, modes_from(
-                starts, self._likelihood, signals, aligned, float(margin.max())),
-                signals, aligned, whitened, margin)
+                starts, self._likelihood, signals, aligned, float(margin.max()),
+                self._refinement.is_exact), signals, aligned, whitened, margin)
             fits.update(self._fits_of(scope, modes, signals))
         return [fits[shot] for shot in range(len(aligned))]
 
@@ -396,7 +396,7 @@ class SearchEstimator(abc.ABC):
             parts[0] = select(parts[0], parts[0].shots != shot)
             parts.append(modes_from(
                 starts._replace(shots=starts.shots + shot), self._likelihood, signals, aligned,
-                float(margin.max())))
+                float(margin.max()), self._refinement.is_exact))
         modes = concatenate(*parts)
         return select(modes, np.argsort(modes.shots, kind='stable'))
 

@@ -343,19 +343,13 @@ class FailedSurfaces:
 class Place:
     """A point at which the signals of a shot are evaluated."""
 
-    model: 'FailureModel'
     point: np.ndarray  # (r [m], u, v), float64 [3].
     values: np.ndarray  # Nuisance parameters, float64 [Q].
     # Residual of an intact surface, and derivatives of the mean with respect to the point and the
     # parameters, complex128 [4 + Q, N_B, N_SB F].
     columns: np.ndarray
-
-    @functools.cached_property
-    def gains(self) -> np.ndarray:
-        """Those of `frame_gains` by point and velocity, [1 + U, N_B, N_SB, F, N_E]; when used."""
-        likelihood = self.model.likelihood
-        return frame_gains(likelihood.scenario, *likelihood.nuisance.states(
-            self.point[None], self.values[None]))[0]
+    # Those of `frame_gains` by point and velocity, [1 + U, N_B, N_SB, F, N_E], once they are used.
+    gains: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0))
 
 
 def of_elements(gains: np.ndarray, n_frames: int) -> np.ndarray:
@@ -414,7 +408,17 @@ class FailureModel:
             (divided - mean)[:, None], slopes,
             prior.derivatives(divided, mean, prior.multipath_share)[
                 :, prior.velocity.shape[1]:]], axis=1)
-        return [Place(self, *each) for each in zip(points, values, columns, strict=True)]
+        return [Place(*each) for each in zip(points, values, columns, strict=True)]
+
+    def gains_at(self, places: Sequence[Place]) -> np.ndarray:
+        """Return `Place.gains` of P places, complex128 [P, 1 + U, N_B, N_SB, F, N_E]."""
+        if new := [place for place in places if not place.gains.size]:
+            states = self.likelihood.nuisance.states(
+                np.stack([place.point for place in new]), np.stack([one.values for one in new]))
+            for place, gains in zip(
+                    new, frame_gains(self.likelihood.scenario, *states), strict=True):
+                place.gains = gains
+        return np.stack([place.gains for place in places])
 
     def effects_of(self, elements: slice | list[int], places: Sequence[Place]
                    ) -> tuple[np.ndarray, np.ndarray]:
@@ -424,7 +428,7 @@ class FailureModel:
         derivative of the mean with respect to the normalised amplitude, [n, P, N_B, N_SB F].
         """
         prior, effects = self.likelihood.nuisance, self.surfaces.effects
-        gains = of_elements(np.stack([place.gains[..., elements] for place in places]),
+        gains = of_elements(self.gains_at(places)[..., elements],
                             self.likelihood.scenario.n_frames)
         changes = gains * effects.shift[elements][:, None, None]
         fixed = (prior.scaled_patterns * (1 - prior.multipath_share)[:, None, None])[

@@ -43,6 +43,8 @@ class _Ascent(NamedTuple):
     # Maximum number of exact steps. Few modes need more than two, unless signals are strong. At
     # the border of the region, small gains may alternate.
     steps: int = 8
+    # Number of steps to modes from which a refinement starts, which then takes steps of its own.
+    coarse: int = 3
     # A mode has converged when its last step changed the log-likelihood by less.
     gain: float = 0.05
     # Share of the latest step by which the next one turns back, above which it is shortened.
@@ -182,15 +184,16 @@ def find_modes(likelihood: Likelihood, grid: TemplateTable, signals: Signals,
 
 
 def modes_from(starts: Starts, likelihood: Likelihood, signals: Signals, aligned: np.ndarray,
-               extra_margin: float = 0.0) -> Modes:
+               extra_margin: float = 0.0, is_last: bool = True) -> Modes:
     """Ascend from the starts on the grid to the modes; see `find_modes`.
 
     `aligned`, float64 [N, Q], contains the parameters that follow from the signals alone, and 0
-    for the others. `extra_margin` admits modes that are less likely than usual.
+    for the others. `extra_margin` admits modes that are less likely than usual. Unless the modes
+    are the last ones, a refinement continues from them.
     """
     starts = starts._replace(values=starts.values + aligned[starts.shots])
-    return ascend(likelihood, likelihood, starts, signals, _ASCENT.steps,
-                  EXACT_MARGIN + extra_margin)
+    return ascend(likelihood, likelihood, starts, signals,
+                  _ASCENT.steps if is_last else _ASCENT.coarse, EXACT_MARGIN + extra_margin)
 
 
 def likely_modes(modes: Modes, n: int) -> Modes:
