@@ -36,6 +36,9 @@ N_USERS = 8
 # Roles without which a surface carries no data, and those without which it has no posterior.
 OF_DATA = {'rhs_controller', 'transmission', 'channel', 'receiver'}
 OF_POSTERIOR = {'rhs_controller', 'positioner', 'channel', 'receiver'}
+NODES_OF_FRONT = ['users' if role == 'user' else role for role in ROSTER]
+# Other tests examine the choice of the band, which would take time in each cycle.
+ONE_BAND = {'band': 0}
 FILES = {'front': {'scenario': 'table1.yaml', 'codebook': 'codebook.yaml'},
          'side': {'scenario': 'resonant.yaml', 'codebook': 'codebook_resonant.yaml'}}
 POSES = {'front': ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]),
@@ -115,17 +118,24 @@ class Running:
         self._clients = {name: self.front.node.create_client(Trigger, f'bs/{name}')
                          for name in ('pause', 'resume')}
         self.running = {}
+        # Tests kill the nodes of the second surface one by one. Those of the first one share a
+        # process, as by default.
         for role in FOLLOWING:
             self.start('/side', role)
         # Fewer references than 300 suffice: a user is compared with the nearest 40.
         self.start('/', 'fusion', attributes={'_N_REFERENCES': 60})
-        for role, member in ROSTER.items():
-            if member.is_unique:
-                self.start('/front', role, **({'rest_s': 0.4} if role == 'bs' else {}))
-        self.start('/front', 'user', name='users', user_count=N_USERS, mobility='random_walk',
-                   speed_mps=1.0)
+        # With the site file of the process, it would run the other surface, too.
+        file = site_file.with_name('front.yaml')
+        file.write_text(yaml.safe_dump({f'/front/{node}': {'ros__parameters': {
+            'site_file': str(site_file)}} for node in NODES_OF_FRONT}), encoding='utf-8')
+        self.running['/front', 'network'] = self._processes.start(
+            'network', '--params-file', file, namespace='/front',
+            attributes={'MAX_USER_NODES': 0}, users=N_USERS, mobility='random_walk',
+            speed_mps=1.0, rest_s=0.4, **ONE_BAND, **STEPS)
 
     def start(self, namespace, role, **parameters):
+        if role == 'transmission':
+            parameters |= ONE_BAND
         self.running[namespace, role] = self._processes.start(
             role, namespace=namespace, site_file=self.site_file, **parameters)
 
@@ -157,6 +167,11 @@ class Running:
             yield
         finally:
             self._request('resume')
+
+    def wait_for(self, node):
+        """Wait for a node of another process, which starts without cycles meanwhile."""
+        with self.paused():
+            self.until(lambda: node in self.fused.node.get_node_names(), node)
 
     def _request(self, name):
         client = self._clients[name]
@@ -221,8 +236,8 @@ def test_the_surfaces_receive_the_same_pilots_with_noise_of_their_own(running):
 def test_the_policy_and_the_graph_of_a_site_agree(running):
     running.until_fused(BOTH)
     allowed = rules(permissions.policy(users=N_USERS, site=running.site))
-    nodes = {f'{"" if space == "/" else space}/{"users" if role == "user" else role}'
-             for space, role in running.running}
+    nodes = {'/fusion', *(f'/front/{node}' for node in NODES_OF_FRONT),
+             *(f'/side/{role}' for role in FOLLOWING)}
     # Without tracks, a positioner publishes no odometry.
     unused = {f'{space}/{topics.ODOMETRY.format(user=user)}'
               for space in ('/front', '/side') for user in range(1, N_USERS + 1)}
@@ -279,6 +294,7 @@ def recorded(running, built_scripts, tmp_path_factory):
     with subprocess.Popen(
             [ROOT / 'scripts' / 'record', path, '--site', running.site_file],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        running.wait_for('recorder')
         # The recorder discovers the topics one by one.
         missing = {'front/ground_truth', 'position_estimate', *(
             f'{name}/{topic}' for name in ('front', 'side')
@@ -418,10 +434,10 @@ def test_a_surface_that_has_moved_is_named_and_its_pose_is_found(
             [ROOT / 'scripts' / 'calibrate', '--site', running.site_file, '--cycles', '24',
              '--output', tmp_path / 'found.yaml'], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             text=True) as process:
+        running.wait_for('calibrator')
         # The node ends when it has received enough.
-        for is_present in (True, False):
-            running.until(lambda expected=is_present: expected == (
-                'calibrator' in running.fused.node.get_node_names()), 'the calibration')
+        running.until(lambda: 'calibrator' not in running.fused.node.get_node_names(),
+                      'the calibration')
         running.until(lambda: 'warning.poses' in reports[-1], 'the warning')
         with running.paused():
             output, errors = process.communicate(timeout=240)
