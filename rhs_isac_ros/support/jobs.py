@@ -25,7 +25,6 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -43,6 +42,9 @@ class JobError(Exception):
 
 
 Function: TypeAlias = Callable[..., Mapping[str, Any]]
+# Code contains only constants. Its description takes milliseconds for a module.
+_of_code = functools.cache(
+    lambda code: _definition((code.co_code, code.co_names, code.co_consts), set()))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +124,7 @@ def _definition(value: Any, seen: set[int]) -> Any:
         ordered = value if isinstance(value, list | tuple) else sorted(value, key=repr)
         return [_definition(one, seen) for one in ordered]
     if inspect.iscode(value):
-        return _definition((value.co_code, value.co_names, value.co_consts), seen)
+        return _of_code(value)
     is_function, is_class = inspect.isfunction(value), isinstance(value, type)
     kind: Any = type(value)
     if not (is_function or is_class) and (
@@ -177,18 +179,17 @@ def _digest(*files: str, text: str) -> str:
 
 def _code_of(module: types.ModuleType) -> str:
     """Return a digest of the functions and classes of a module as this process has loaded them."""
-    own = {name: value for name, value in vars(module).items()
-           if getattr(value, '__module__', '') == module.__name__}
-    codes = {f'{name}.{inner}': inspect.unwrap(one).__code__ for name, value in own.items()
-             for inner, one in (vars(value).items() if isinstance(value, type) else [('', value)])
+    codes = {f'{name}.{part}': inspect.unwrap(one).__code__ for name, value in vars(module).items()
+             if getattr(value, '__module__', '') == module.__name__
+             for part, one in (vars(value).items() if isinstance(value, type) else [('', value)])
              if inspect.isfunction(one)}
     return hashlib.sha256(json.dumps(_definition(codes, set())).encode()).hexdigest()[:16]
 
 
 @one_blas_thread
 def attempt(function: Function, job: Job,
-            given: Mapping[tuple[str, str], Any] = MappingProxyType({}),
-            modules: Mapping[str, str] = MappingProxyType({})) -> JobResult:
+            given: Mapping[tuple[str, str], Any] = types.MappingProxyType({}),
+            modules: Mapping[str, str] = types.MappingProxyType({})) -> JobResult:
     """Run a job in this process; return errors as text, because some errors cannot be pickled.
 
     `given` are objects of the process that wants the result, to which names of plug-ins refer, by
