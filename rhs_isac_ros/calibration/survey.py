@@ -51,7 +51,7 @@ COVERAGE = 0.95
 _PASSING = 0.99
 # Distance of positions that count as one place [wavelengths of the lowest band]. Over a few
 # wavelengths, only the phases of paths change. With a smaller distance, a walk would count each
-# cycle as a place, and a survey of a walk would promise too much.
+# cycle as a place, and covariances from it would be too small.
 PLACE_WAVELENGTHS = 4.0
 # Inflation t without places, and the weight of this value, in places. It is a margin for
 # small surveys, in which the quantiles above are uncertain.

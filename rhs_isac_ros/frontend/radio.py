@@ -205,5 +205,5 @@ class WaveformRadio:
         return signals + np.sqrt(self._noise_w) * complex_normal(signals.shape, air.rng)
 
     def close(self) -> None:
-        """Forget the offsets."""
+        """Discard the offsets."""
         self._offsets = None

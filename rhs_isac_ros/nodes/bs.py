@@ -67,7 +67,7 @@ class _Slots:
         return length_s
 
     def _end_slot(self) -> None:
-        # The next slot begins when this one really ends. With times that are fixed in advance, a
+        # The next slot begins when this one has ended. With times that are fixed in advance, a
         # delayed process would send all overdue answers at once.
         length_s = self._begin_slot()
         self._waiting.popleft().set_result(None)

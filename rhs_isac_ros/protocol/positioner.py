@@ -111,7 +111,7 @@ class Tracks:
 
         Returns the position in the frame of the surface, float64 [3] [m], the root of the mean
         variance of its coordinates [m], and the interval [s]. The result is None without two
-        signals, or if the latest signals speak against the track.
+        signals, or if the latest signals contradict the track.
         """
         track = self._tracks.get(user)
         if not (track and track.interval_s > 0 and self.posterior) or self.posterior.is_elsewhere:

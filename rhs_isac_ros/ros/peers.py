@@ -217,7 +217,7 @@ class Peers:
         was_known = self._presences.knows(presence.sender)
         self._presences.add(presence, time.time_ns(), self._now_s())
         if self._period_s > PERIOD_S and self._presences.knows(presence.sender) > was_known:
-            # So that the new node soon hears this one.
+            # So that the new node soon receives an announcement of this one.
             self._changed.set()
         if self._find() != self._newest:
             endpoints.set_period(self._timer, self._poll())

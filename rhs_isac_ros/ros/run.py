@@ -1,4 +1,4 @@
-"""The life of a node: command line, init, spin, shutdown; and the errors at its start.
+"""Command line, init, spin and shutdown of nodes, and the errors at their start.
 
 `starting` makes each error at the start a `StartError` of one line. A command prints it and
 ends with exit code 2.

@@ -192,7 +192,7 @@ def attempt(function: Function, job: Job,
             modules: Mapping[str, str] = types.MappingProxyType({})) -> JobResult:
     """Run a job in this process; return errors as text, because some errors cannot be pickled.
 
-    `given` are objects of the process that wants the result, to which names of plug-ins refer, by
+    `given` are objects of the process that gets the result, to which names of plug-ins refer, by
     `plugins.key_of`, and `modules` the digests of modules by their names. A worker of a cluster
     may have loaded a module before it was edited.
     """
@@ -271,7 +271,7 @@ def _file(folder: Path, job: Job) -> Path:
 
 
 # Timeouts for the scheduler of a cluster and its first worker, and time after which a job notices
-# that nobody waits for it any more.
+# that its client or parent has ended.
 _SCHEDULER_TIMEOUT_S = 30
 _WORKER_TIMEOUT_S = 30
 _WATCH_S = 1.0
@@ -511,7 +511,7 @@ def _cluster(address: str) -> Iterator[Executor]:
 
 
 class _AbandonedError(BaseException):
-    """Nobody waits for a job any more."""
+    """The client of a job has ended."""
 
 
 def _attempt_on_cluster(

@@ -1,4 +1,4 @@
-"""What is combined with what: consistency of positions for all pairs of capabilities.
+"""Consistency of positions for all pairs of capabilities.
 
 Problem: sites, tracks, priors, impairments and the rest are each measured alone. Are positions
 also consistent where two of them meet? Each cell of the table combines two ingredients, each

@@ -1,4 +1,4 @@
-"""The price of a wrong declaration: fields of the scenario that are wrong by a factor of two.
+"""Errors with wrong declarations: fields of the scenario that are wrong by a factor of two.
 
 Problem: the estimator assumes the band plan, but the true value of one field is twice or half that
 of the plan (a level: 3 dB higher or lower; the refractive index: 0.2 %). How large do the errors
