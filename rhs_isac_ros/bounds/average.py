@@ -166,7 +166,7 @@ class AverageCrlb(Average):
 
     Nuisance parameters, errors of the elements and `region_prior` are treated as in `crlb`.
     `tolerance` is the same as in `Average`. `tick` is called repeatedly while rows are
-    computed, and may raise an exception to end the computation.
+    computed, and may raise an exception to end it. Raises ValueError as `average_crlb` does.
     """
 
     def __init__(self, scenario: Scenario, positions: np.ndarray, tolerance: float = 0.0, *,

@@ -31,7 +31,10 @@ _STARTS = 8
 
 
 def raster(spectrum_hz: Sequence[tuple[float, float]], raster_hz: float) -> np.ndarray:
-    """Return the frequencies of the raster in the spectrum, ascending, float64 [n] [Hz]."""
+    """Return the frequencies of the raster in the spectrum, ascending, float64 [n] [Hz].
+
+    Raises ValueError if there is no interval, or a number is not positive or finite.
+    """
     if not 0 < raster_hz < math.inf:
         raise ValueError(f'raster: {raster_hz:g} Hz, expected a positive number')
     if not spectrum_hz:
@@ -171,6 +174,7 @@ def best_of(
     The candidates are in ascending order of their errors. A later plan replaces an earlier one
     only if its new error is clearly lower; candidates with much larger errors are skipped.
     `options` are those of `optimize`. `report` is called with each candidate and its new error.
+    Raises ValueError if there are no candidates.
     """
     if not candidates:
         raise ValueError('candidates: none, expected at least one')

@@ -339,7 +339,8 @@ def optimised(
         **options: Any) -> dict[str, Any]:
     """Run a job: optimise a codebook, and return it with the history and the reason for the end.
 
-    Raises KeyboardInterrupt after Ctrl-C: an unfinished optimisation is no result.
+    Raises KeyboardInterrupt after Ctrl-C: an unfinished optimisation is no result; and
+    CodebookError if the file of the calibration has changed.
     """
     surface = Calibration.load(calibration[0]) if calibration else None
     if surface and calibration and surface.id != calibration[1]:

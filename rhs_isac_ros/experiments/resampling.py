@@ -53,6 +53,7 @@ def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -
     (Rao and Wu, Resampling inference with complex survey data, 1988). A single member contributes
     no variance. Use different seeds for different sets of members. Results with the same number of
     cases share the resampled cases. `quantiles` are from 0 to 1; if empty, return the mean.
+    Raises ValueError if no result is finite, or a quantile is out of range.
     """
     if results.ndim != 2 or not np.isfinite(results).any():
         raise ValueError(f'results: shape {results.shape}, expected [members, cases] with a '

@@ -41,6 +41,8 @@ _LONGEST_LINE = 256
 class OpenSourceRis:
     """Driver of the board; it opens the port when it first needs it, and after each failure.
 
+    Raises ValueError if the board has another number of elements, or a number is out of range.
+
     Parameters
     ----------
     n_elements : int

@@ -252,7 +252,10 @@ class PlaybackRadio:
         return {**self._waveform.status(), 'radio.played': str(self._n_cycles)}
 
     def capture(self, band: int, pilot: np.ndarray) -> np.ndarray:
-        """Return the recorded samples of the present frame, complex [K, n]."""
+        """Return the recorded samples of the present frame, complex [K, n].
+
+        Raises EOFError after the last cycle, and LookupError if the cycle lacks the band.
+        """
         if self._air.cycle_id != self._cycle_id:
             self._cycle = next(self._cycles, {})
             self._cycle_id = self._air.cycle_id

@@ -124,7 +124,10 @@ class Waveform:
                 'radio.noise_power': f'{self.noise_power:.3g}'}
 
     def synchronise(self, captures: np.ndarray) -> Synchronisation:
-        """Estimate timing and carrier from the captures of a band, complex128 [F, K, n]."""
+        """Estimate timing and carrier from the captures of a band, complex128 [F, K, n].
+
+        Raises ValueError if a capture is shorter than a frame.
+        """
         n = self.n_period
         if captures.shape[-1] < self.n_frame:
             raise ValueError(f'captures: {captures.shape[-1]} samples, expected at least '

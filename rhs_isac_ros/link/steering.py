@@ -166,7 +166,10 @@ def steer(scenario: Scenario, position: np.ndarray, band: int = 0,
 def steer_bands(
         scenario: Scenario, position: np.ndarray, bands: Sequence[int],
         surface: SurfaceEstimate | None = None) -> list[Beamformer]:
-    """Find the beams of `steer` for several bands, in little more time than for one band."""
+    """Find the beams of `steer` for several bands, in little more time than for one band.
+
+    Raises ValueError as `steer` does, or if there are no bands.
+    """
     if not len(bands):
         raise ValueError('bands: none, expected at least one')
     bands = [whole('band', band, high=scenario.n_bands - 1) for band in bands]

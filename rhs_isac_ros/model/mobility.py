@@ -87,7 +87,8 @@ class Crowd:
     def states(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the positions, float64 [N, 3] [m], and velocities, float64 [N, 3] [m/s].
 
-        The times of successive calls must not decrease. Raises ValueError if one is not finite.
+        The times of successive calls must not decrease. Raises ValueError if one is not finite,
+        and PluginError if a mobility of a plug-in fails or returns no valid leg.
         """
         now_s = finite('now_s', now_s)
         for user in np.flatnonzero(now_s >= self._end_s).tolist():

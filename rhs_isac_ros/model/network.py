@@ -64,7 +64,8 @@ class Admittances(NamedTuple):
     def of(cls, content: Mapping[str, Any]) -> 'Admittances':
         """Convert and check the arrays of a file, [P, ...] or those of a single frequency.
 
-        Raises ValueError unless the network is reciprocal and passive.
+        Raises ValueError, mostly BoardError, if an array is missing or has another shape, or the
+        network is not reciprocal and passive.
         """
         if missing := {'frequency_hz', 'y_tt', 'y_st', 'y_ss'} - content.keys():
             raise BoardError(f'no {", ".join(sorted(missing))}, expected the admittances of '

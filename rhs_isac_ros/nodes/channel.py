@@ -1,12 +1,10 @@
 """The executable ``channel``: surface and radio, and the emulated radio channel."""
 
-import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 from rhs_isac_ros.frontend import Air, FrontEnd, Radio, SampleRecorder, make_radio, make_surface
-from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol.channel import Channel, apply_patterns
 from rhs_isac_ros.ros.endpoints import BackgroundWorker, surviving
@@ -73,13 +71,12 @@ class ChannelNode(RoleNode[Channel]):
             return
         self._run(functools.partial(apply_patterns, self._front_end, action), self.dispatch)
 
-    def report(self) -> Report:
-        """Return the diagnostics, with those of the radio."""
-        of_radio: Mapping[str, str] = {}
+    def details(self) -> Mapping[str, str]:
+        """Return the diagnostics of the radio."""
+        found: Mapping[str, str] = {}
         with surviving(self):
-            of_radio = self._front_end.status()
-        report = super().report()
-        return dataclasses.replace(report, details={**report.details, **of_radio})
+            found = self._front_end.status()
+        return found
 
     def stand_by(self) -> None:
         """Release surface and radio after the request in progress."""

@@ -100,7 +100,8 @@ class OptimizerNode(RoleNode[Holder]):
     """Holds the codebook as parameters that can only be set together, and announces it.
 
     The first codebook comes from a parameter file on the command line or from ``codebook_file``.
-    While a newer optimizer is present, this one withdraws its announcement.
+    While a newer optimizer is present, this one withdraws its announcement. Raises CodebookError
+    if the first codebook is invalid or does not fit the scenario.
     """
 
     def __init__(self, **node_options: Any) -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import time
 import types
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,6 @@ from rhs_isac_ros import positioning
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import simulate_received
 from rhs_isac_ros.model.geometry import movement_warning
-from rhs_isac_ros.monitoring.role_statistics import Report
 from rhs_isac_ros.positioning.alternatives import unrecognised_outside
 from rhs_isac_ros.positioning.estimate import estimate_of
 from rhs_isac_ros.positioning.site import share_left_out
@@ -101,13 +101,9 @@ class PositionerNode(LocatingNode[Positioner]):
             f'table of templates: {100 * share:.0f} % computed',
             throttle_duration_sec=_LOG_PERIOD_S, skip_first=True)
 
-    def report(self) -> Report:
-        """Return the diagnostics, which show progress while a table is being computed."""
-        report = super().report()
-        if not self._table:
-            return report
-        return dataclasses.replace(
-            report, details={**report.details, TABLE_PROGRESS: self._table})
+    def details(self) -> Mapping[str, str]:
+        """Return the progress of a table that is being computed."""
+        return {TABLE_PROGRESS: self._table} if self._table else {}
 
     def execute(self, action: events.Action) -> None:
         """Build or prepare an estimator in the background, or process another action."""

@@ -113,7 +113,7 @@ def discovery_range() -> str:
 
 
 def claim_domain() -> str:
-    """Return a ROS domain that no other process has claimed; the claim ends with this process."""
+    """Claim a ROS domain until this process ends; raise RuntimeError if none is unclaimed."""
     for offset in range(_DOMAINS):
         domain = 1 + (os.getpid() + offset) % _DOMAINS
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)

@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.srv import GetParameters
@@ -231,7 +231,11 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
         return self._statistics.report(
             '' if state is None else state.value, self.role.counters,
             state in self.role.BLOCKED_STATES,
-            {**self.role.status(), **self._peers.conflicts()})
+            {**self.role.status(), **self._peers.conflicts(), **self.details()})
+
+    def details(self) -> Mapping[str, str]:
+        """Return further values of the diagnostics; by default, there are none."""
+        return {}
 
     def stand_by(self) -> None:
         """Handle the takeover of the role by a newer node."""

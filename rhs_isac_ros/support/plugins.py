@@ -124,7 +124,7 @@ def is_reference(name: Any) -> bool:
 
 
 def name_of(plugin: Any) -> str:
-    """Return the name of a plug-in; remember an object that is given in place of a name."""
+    """Return the name of a plug-in, or of an object in its place, which must be callable."""
     if isinstance(plugin, str):
         return plugin
     if not callable(plugin):
