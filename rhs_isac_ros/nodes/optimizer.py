@@ -176,7 +176,7 @@ class OptimizerNode(RoleNode[Holder]):
             return
         self._publisher.publish(convert.to_bytes(
             convert.CodebookMessage.of(codebook, self.instance, self.scenario.id),
-            self.get_clock().now().nanoseconds))
+            self.get_clock().now().nanoseconds, frame=self.frame.surface))
         self.get_logger().info(  # type: ignore[no-untyped-call]
             f'codebook {codebook.id}: average CRLB {codebook.average_crlb_m2:.4f} m^2')
 

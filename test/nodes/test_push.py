@@ -21,11 +21,14 @@ def network(make_watch, module_processes, small_files, output):
     process = module_processes.start('optimizer', namespace='/push', options=(
         '--method', 'directional', '--positions', '8', '--quiet', '--output', output,
         '--scenario', small_files / 'scenario.yaml'))
-    watch, ids = make_watch('/push'), []
-    watch.node.create_subscription(
-        ros.Codebook, topics.CODEBOOK, lambda message: ids.append(message.codebook_id),
-        LATCHED)
+    watch, ids, frames = make_watch('/push'), [], []
+
+    def receive(message):
+        ids.append(message.codebook_id)
+        frames.append(message.header.frame_id)
+    watch.node.create_subscription(ros.Codebook, topics.CODEBOOK, receive, LATCHED)
     watch.until(lambda: ids, 'the codebook', [process])
+    assert frames[0] == 'push/rhs_link'
     return process, watch, ids
 
 
