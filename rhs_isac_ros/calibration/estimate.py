@@ -53,6 +53,13 @@ class Pilots:
 
     `positions` are float64 [N, 3] [m]; `received` are complex128 [N, N_B, N_SB F], sub-band-major.
     Raises ValueError if a shape is wrong or a number is not finite.
+
+    Examples
+    --------
+    >>> system = System(Scenario(), Codebook.default())
+    >>> pilots = Pilots(system.codebook, *system.pairs(20, seed=1))
+    >>> calibrate(system.scenario, [pilots]).surface.gains.shape
+    (100,)
     """
 
     beams: Beamforming

@@ -163,6 +163,13 @@ class PathChannel(ArrayFile):
     Users have at most P paths; the amplitude of missing ones is 0. `f0` may be an array of one
     number. Raises ArchiveError if sizes disagree, or a number is not finite or physically
     impossible.
+
+    Examples
+    --------
+    >>> users = np.array([[8.0, 1.0, 0.2]])
+    >>> gain = SPEED_OF_LIGHT_MPS / (4 * np.pi * 2.75e9 * np.linalg.norm(users))
+    >>> PathChannel(users, [[gain]], users[:, None], [[0]], 2.75e9).nearest(users + 0.1)
+    array([0])
     """
 
     users: np.ndarray  #: Positions, float64 [N, 3] [m], in the frame of the scenario.

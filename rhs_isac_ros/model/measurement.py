@@ -213,6 +213,12 @@ class MeasurementModel:
         the errors of the estimate. By default, the errors of the elements are unknown and have the
         declared distribution: the mean is an average over surfaces, and the covariance includes
         the errors.
+
+    Examples
+    --------
+    >>> model = MeasurementModel(Scenario(), Codebook.default())
+    >>> model.mean(np.array([[8.0, 1.0, 0.2]])).shape  # [N, N_B, N_SB F]
+    (1, 2, 32)
     """
 
     @one_blas_thread

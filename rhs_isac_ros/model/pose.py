@@ -31,6 +31,12 @@ class Pose:
 
     Raises ValueError if a value does not have the expected shape, is not finite, or is no
     orientation or covariance.
+
+    Examples
+    --------
+    >>> pose = Pose((0.0, 10.0, 1.0), (0.0, 0.0, -1.0, 1.0))  # Faces -y.
+    >>> pose.to_site(np.array([[8.0, 0.0, 0.0]])).round(2)
+    array([[0., 2., 1.]])
     """
 
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  #: p, x, y, z [m].
