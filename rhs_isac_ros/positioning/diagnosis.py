@@ -18,6 +18,7 @@ directions of the signals, or if levels differ between users or places (`diagnos
 """
 
 import collections
+import math
 from collections.abc import Collection, Iterable
 from typing import NamedTuple
 
@@ -112,13 +113,16 @@ def _excess(subject: str, value: float, limit: float) -> str:
     return '' if value <= limit else f'{subject}: {value:.3g}, expected at most {limit:.3g}'
 
 
-def misfit_log_ratio(residual: float, n: int) -> float:
+def misfit_log_ratio(residual: float, n: int, level_db: tuple[float, float] = (0.0, 0.0)) -> float:
     """Return how likely n measurements with a residual energy fit no position: a log-likelihood.
 
-    It is relative to the best position. The residual then has an unknown level.
+    It is relative to the best position, with the median and standard deviation `level_db` of the
+    multipath. Without a position, the residual has an unknown level.
     """
-    (evidence,) = gaussian.log_evidence_of_level(np.array([residual]), n, gaussian.BLOCKED_STD_DB)
-    return float(evidence) + residual
+    median_db, std_db = level_db
+    in_sight, misfit = (gaussian.log_evidence_of_level(np.array([residual]), n, one_db, median_db)
+                        for one_db in (std_db, math.hypot(std_db, gaussian.BLOCKED_STD_DB)))
+    return float((misfit - in_sight)[0])
 
 
 class InnovationTest:

@@ -585,16 +585,16 @@ class _Found(NamedTuple):
         estimator, estimate, fit = self.estimator, self.estimate, self.fit
         assert fit is not None
         mixture, sheets = fit.describe()
-        bounds_m = estimator._bounds
-        blocked = float(np.nan_to_num(estimate.blocked_probability))
-        pose = estimator.scenario.pose
+        scenario, bounds_m = estimator.scenario, estimator._bounds
+        pose, blocked = scenario.pose, float(np.nan_to_num(estimate.blocked_probability))
         placed = mixture.scaled(estimator._scale(fit)).moved(Pose(), pose)
         log_ratio = self.log_ratios.get(Outside.name, -np.inf)
-        places = places_of(self.outside(), log_ratio, estimator.scenario) if (
+        places = places_of(self.outside(), log_ratio, scenario) if (
             self.outside and np.ptp(bounds_m, axis=0).all() and np.isfinite(log_ratio)) else None
         return Sighting(
             pose, placed.weighted(fit.log_evidence + log_size(bounds_m)),
             float(np.clip(blocked + (1 - blocked) * MISS_PROBABILITY, 0.0, 1 - 1e-12)), sheets,
-            misfit_log_ratio=misfit_log_ratio(fit.residual, estimator._n_measurements),
+            misfit_log_ratio=misfit_log_ratio(
+                fit.residual, estimator._n_measurements, scenario.multipath_level_db),
             places=places, region_m=bounds_m,
             **{f'{name}_log_ratio': value for name, value in self.log_ratios.items()})

@@ -329,3 +329,14 @@ def test_doubts_are_described_from_one_percent_on():
     estimate = Estimate(*place, outside_probability=0.004, blocked_probability=0.12)
     assert describe_doubts(estimate) == 'blocked 12 %'
     assert describe_doubts(Estimate(*place)) == ''
+
+
+@pytest.mark.parametrize('relative', [0.2, 1.0, 5.0])
+def test_a_misfit_is_compared_with_positions_at_the_surveyed_level(relative):
+    n, residual = 20, relative * 20
+    exact, surveyed, shifted = (
+        diagnosis.misfit_log_ratio(energy, n, level_db) for energy, level_db in (
+            (residual, (0.0, 0.0)), (residual, (0.0, 4.0)), (residual / 100, (-20.0, 4.0))))
+    # Where levels vary, positions explain residuals far from the nominal level, too.
+    assert (surveyed < exact) == (relative != 1.0)
+    assert shifted == pytest.approx(surveyed, abs=1e-9)
