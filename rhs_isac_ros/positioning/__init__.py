@@ -75,6 +75,7 @@ def make_estimator(name: Any, scenario: Scenario, codebook: Codebook, *,
                    surface: KnownSurface | None = None, **options: Any) -> Estimator:
     """Create an estimator of a system; see `EstimatorKind.create`.
 
+    `surface` is that of the system, such as a calibration; None stands for that of the scenario.
     `name` is that of a built-in estimator or of an installed plug-in, ``module:name``, or the
     class or callable itself. `bayes` and `ml` take the options of `SearchEstimator`. `neural`
     requires ``model_file``, a `Network` or its file. Plug-ins define their own options.

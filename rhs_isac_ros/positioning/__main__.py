@@ -24,9 +24,7 @@ from rhs_isac_ros.support.progress import progress_bar
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return the code of `exit_code_of`."""
-    parser = ArgumentParser(
-        prog='python3 -m rhs_isac_ros.positioning', description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = ArgumentParser(prog='python3 -m rhs_isac_ros.positioning', description=__doc__)
     add = parser.add_argument
     add('--codebook', type=input_file, required=True, help='codebook file')
     add('--scenario', '--config', type=input_file,

@@ -55,7 +55,10 @@ def system(config: Path, case: str) -> tuple[Scenario, Codebook, dict[str, Any]]
 
 
 def signals(config: Path, case: str, n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Simulate the signals of a case at n positions, for each surface."""
+    """Simulate the signals of a case at n positions, for each surface.
+
+    Elements fail and deviate anew for each position, except in a site.
+    """
     if case == FUSION:
         site = Site.from_yaml(config / 'site.yaml')
         low, high = site.bounds_m
@@ -67,7 +70,8 @@ def signals(config: Path, case: str, n: int, rng: np.random.Generator) -> dict[s
         positions = positions[walk]
         positions[:, 1] += STEP_M * cycle
         positions = np.clip(positions, *scenario.roi_bounds_m)
-    return {case: MeasurementModel(scenario, codebook, **known).sample(positions, rng)}
+    model = MeasurementModel(scenario, codebook, **known)
+    return {case: np.concatenate([model.sample(one[None], rng) for one in positions])}
 
 
 def function(config: Path, case: str, received: dict[str, np.ndarray]) -> Callable[[Any], Any]:
