@@ -110,7 +110,7 @@ class SearchEstimator(abc.ABC):
         prior, it rarely is.
     left_out
         Largest share of the posterior of modes that are left out, from 1e-12 to
-        `MISS_PROBABILITY`; less if other surfaces may favour them.
+        `MISS_PROBABILITY`; if other surfaces may favour them, less, and positions are not drawn.
     """
 
     averages = True  # Whether positions are averages over the posterior.
@@ -170,7 +170,7 @@ class SearchEstimator(abc.ABC):
                 scenario, self._load(outside=True),
                 self._averaging.states(MeasurementModel.covariance), self._unknown_level)
             scope = scope._replace(alternatives=[outside, *scope.alternatives])
-        if self.averages and self._is_plain:
+        if self.averages and self._is_plain and self.left_out == MISS_PROBABILITY:
             scope = scope._replace(drawn=DrawnPosterior(
                 scenario, scope.table, self._n_measurements))
         return scope

@@ -134,3 +134,13 @@ def test_the_estimate_of_a_posterior_is_that_of_the_estimator(codebook):
         assert error @ np.linalg.solve(covariance, error) < 0.01
         np.testing.assert_allclose(
             np.diag(fused.covariance), np.diag(covariance), rtol=0.15, atol=0.01)
+
+
+def test_modes_are_not_drawn_where_other_surfaces_may_favour_them(codebook):
+    """Groups of draws represent modes of small shares poorly."""
+    rng = np.random.default_rng(2)
+    received = simulate_received(WEAK, codebook, WEAK.sample_positions(4, rng), rng)
+    usual, more = (max(len(make_estimator('bayes', WEAK, codebook, **options).posterior(
+        one).sighting.likelihood.means) for one in received)
+        for options in ({}, {'left_out': 5e-5}))
+    assert usual <= 2**SAMPLING.levels < more
