@@ -21,7 +21,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import mixture_weights
 from rhs_isac_ros.model.gaussian import moments
 from rhs_isac_ros.positioning.estimate import Fit, regular
-from rhs_isac_ros.positioning.grid import TemplateTable, Windows
+from rhs_isac_ros.positioning.grid import Draw, TemplateTable, Windows
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Resolution, carrier_wavenumbers
 from rhs_isac_ros.positioning.mixture import Mixture
 from rhs_isac_ros.positioning.segments import concatenate, select
@@ -53,6 +53,12 @@ class Sampling(NamedTuple):
     least: float = 1e-6
     # Number of range steps to evaluate at a time.
     block: int = 1 << 20
+    # Largest log-likelihood, relative to no direct path, at which positions are drawn. Peaks of
+    # stronger signals are so narrow that draws may hit some of them and miss others. Where other
+    # surfaces may favour peaks of small shares, which groups of rays represent poorly, positions
+    # are drawn only if the peaks are no higher than those of noise.
+    largest: float = 100.0
+    largest_favoured: float = 12.0
 
 
 SAMPLING = Sampling()
@@ -105,6 +111,11 @@ class DrawnPosterior:
             self._log_area = np.log(self._extent).sum(axis=1)
         volume = points[:, 0]**2 * grid.widths_m[grid.range_bin] / _boresight(points[:, 1:])
         self._log_volume = np.log(volume) + self._log_area
+
+    def draw(self, favoured: bool) -> Draw:
+        """Return the draws of a search; other surfaces may favour modes if `favoured` is given."""
+        sampling = self._sampling
+        return Draw(sampling.largest_favoured if favoured else sampling.largest, self.fit)
 
     def fit(self, query: Query, shot: int) -> Fit | None:
         """Compute the posterior of a shot.

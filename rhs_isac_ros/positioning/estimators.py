@@ -110,7 +110,7 @@ class SearchEstimator(abc.ABC):
         prior, it rarely is.
     left_out
         Largest share of the posterior of modes that are left out, from 1e-12 to
-        `MISS_PROBABILITY`; if other surfaces may favour them, less, and positions are not drawn.
+        `MISS_PROBABILITY`; less if other surfaces may favour them.
     """
 
     averages = True  # Whether positions are averages over the posterior.
@@ -170,9 +170,9 @@ class SearchEstimator(abc.ABC):
                 scenario, self._load(outside=True),
                 self._averaging.states(MeasurementModel.covariance), self._unknown_level)
             scope = scope._replace(alternatives=[outside, *scope.alternatives])
-        if self.averages and self._is_plain and self.left_out == MISS_PROBABILITY:
-            scope = scope._replace(drawn=DrawnPosterior(
-                scenario, scope.table, self._n_measurements))
+        if self.averages and self._is_plain:
+            draws = DrawnPosterior(scenario, scope.table, self._n_measurements)
+            scope = scope._replace(drawn=draws.draw(favoured=self.left_out < MISS_PROBABILITY))
         return scope
 
     def prepare(self) -> None:
@@ -369,7 +369,7 @@ class SearchEstimator(abc.ABC):
                   + priors.PRIOR_MARGIN * scope.favoured)
         starts, drawn = scope.table.search(
             whitened, self._likelihood.nuisance, GRID_MARGIN + scope.alignment.margin + margin,
-            scope.drawn.fit if scope.drawn and draws else None)
+            scope.drawn if draws else None)
         fits = {shot: _Searched(fit) for shot, fit in drawn.items()}
         if len(starts.shots):
             modes = self._in_noise(scope, modes_from(

@@ -10,7 +10,7 @@ All lengths of the grid follow from the scenario; see `lattice`.
 
 import functools
 from collections.abc import Callable, Mapping
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,9 +31,14 @@ from rhs_isac_ros.positioning.segments import Segments, concatenate, select
 from rhs_isac_ros.positioning.sheets import move_inside
 from rhs_isac_ros.positioning.templates import Cells, Filters, Query, turns_at
 
-# Computes the posterior of one shot of a query from drawn positions, or returns None if a search
-# for modes is better.
-Draw: TypeAlias = Callable[[Query, int], Fit | None]
+
+class Draw(NamedTuple):
+    """How to draw positions for weak signals, in place of a search for modes."""
+
+    # Largest log-likelihood of a shot, relative to no direct path.
+    largest: float
+    # Computes the posterior of one shot of a query, or returns None if a search is better.
+    fit: Callable[[Query, int], Fit | None]
 
 
 class _Limits(NamedTuple):
@@ -46,9 +51,6 @@ class _Limits(NamedTuple):
     first_cells: int = 48
     # Number of other relevant cells above which positions are drawn, without a search for modes.
     searched_cells: int = 100
-    # Largest log-likelihood, relative to no direct path, at which positions are drawn. Peaks of
-    # stronger signals are so narrow that draws may hit some of them and miss others.
-    drawn_likelihood: float = 100.0
     # Largest number of peaks of a shot that are kept, to limit memory and time. Only signals below
     # the noise have more, and the peaks left out have little weight.
     peaks: int = 8192
@@ -120,7 +122,7 @@ class TemplateTable:
         correction of carrier and timing. `margin` is the negative logarithm of the share of the
         posterior that may be left out, a number or one for each cell, [C]. The points of a shot do
         not depend on the other shots. If a shot has weak signals and very many relevant cells,
-        `draw` is called for it. A shot for which it returns a posterior has no points. These
+        `draw` computes its posterior. A shot for which it returns one has no points. These
         posteriors are returned, too, keyed by the shot.
         """
         n = max(1, _LIMITS.block // (len(self.cells.template_energy) * len(self._wavenumbers)))
@@ -185,10 +187,10 @@ class TemplateTable:
         is_likely[shots, first] = False
         drawn = {}
         if draw:
-            (weak,) = (best <= _LIMITS.drawn_likelihood).nonzero()
+            (weak,) = (best <= draw.largest).nonzero()
             many = is_likely[weak].sum(axis=1) > _LIMITS.searched_cells
             drawn = {shot: fit for shot in weak[many].tolist()
-                     if (fit := draw(query, shot)) is not None}
+                     if (fit := draw.fit(query, shot)) is not None}
         if drawn:
             is_likely[[*drawn]] = False
             peaks = select(peaks, ~np.isin(peaks.shots, [*drawn]))

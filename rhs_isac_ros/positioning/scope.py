@@ -6,8 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rhs_isac_ros.positioning.alternatives import Alternative
-from rhs_isac_ros.positioning.draws import DrawnPosterior
-from rhs_isac_ros.positioning.grid import TemplateTable
+from rhs_isac_ros.positioning.grid import Draw, TemplateTable
 from rhs_isac_ros.positioning.lattice import Grid
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.moving import MovingTable
@@ -22,7 +21,7 @@ class SearchScope(NamedTuple):
     alternatives: Sequence[Alternative]
     #: Cells in which less likely modes are kept as well, bool [C] or [1].
     favoured: np.ndarray
-    drawn: DrawnPosterior | None = None
+    drawn: Draw | None = None
 
     @classmethod
     def of(cls, likelihood: Likelihood, arrays: Mapping[str, np.ndarray], grid: Grid,
