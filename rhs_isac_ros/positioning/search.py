@@ -232,10 +232,10 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
         if not len(moving) or number == n_steps - 1:
             break
         changed = modes.shots[moving]
-        moved, new_gain = step(select(modes, moving).starts())
+        here = select(modes, moving).starts()
+        moved, new_gain = step(here)
         reached = moved.log_likelihood - new_gain
-        _shorten(moved, new_gain, select(modes, moving), select(origins, moving),
-                 likelihood.resolution.bounds_m)
+        _shorten(moved, new_gain, here, origins.points[moving], likelihood.resolution.bounds_m)
         too_long = reached < known[moving] - _ASCENT.gain
         short, long = moving[~too_long], moving[too_long]
         origins.points[short], origins.values[short] = modes.points[short], modes.values[short]
@@ -255,26 +255,29 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
     return modes
 
 
-def _shorten(moved: Modes, gain: np.ndarray, modes: Modes, origins: Starts,
+def _shorten(moved: Modes, gain: np.ndarray, here: Starts, origins: np.ndarray,
              bounds_m: np.ndarray) -> None:
-    """Shorten steps from the modes to those moved, if the steps to the modes were too long.
+    """Shorten steps to the modes if those from the origins, [M, 3], to `here` were too long.
 
     Expected information may be below the curvature, so that each step turns back. Along the latest
     step, the change of the gradient shows the curvature.
     """
-    before, step = modes.points - origins.points, moved.points - modes.points
-    slopes = np.matmul(moved.curvature, before[..., None])[..., 0]
+    (rows,) = np.nonzero(np.abs(gain) > _ASCENT.gain)
+    if not len(rows):
+        return
+    before, step = (here.points - origins)[rows], (moved.points - here.points)[rows]
+    slopes = np.matmul(moved.curvature[rows], before[..., None])[..., 0]
     back = -np.sum(step * slopes, axis=1) / np.maximum(
         np.sum(before * slopes, axis=1), np.finfo(float).tiny)
-    (turned,) = np.nonzero(back > _ASCENT.turn)
-    if len(turned):
-        left = 1 - 1 / (1 + np.minimum(back[turned], 1.0))
-        points = moved.points[turned] - left[:, None] * step[turned]
-        moved.points[turned] = to_polar(np.clip(to_positions(points), *bounds_m))
-        moved.values[turned] -= left[:, None] * (moved.values - modes.values)[turned]
-        moved.log_likelihood[turned] -= left * gain[turned]
-        moved.residual[turned] += left * gain[turned]
-        gain[turned] *= 1 - left
+    turned = back > _ASCENT.turn
+    if turned.any():
+        rows, left = rows[turned], 1 - 1 / (1 + np.minimum(back[turned], 1.0))
+        points = moved.points[rows] - left[:, None] * step[turned]
+        moved.points[rows] = to_polar(np.clip(to_positions(points), *bounds_m))
+        moved.values[rows] -= left[:, None] * (moved.values - here.values)[rows]
+        moved.log_likelihood[rows] -= left * gain[rows]
+        moved.residual[rows] += left * gain[rows]
+        gain[rows] *= 1 - left
 
 
 def _halve(modes: Modes, origins: Starts, gain: np.ndarray, rows: np.ndarray) -> None:
