@@ -30,8 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ('check', 'print serial number, supply and times, and read each element back'),
             ('show', 'print the last pattern: # is 1, . is 0, seen from the front'),
             ('sweep', 'switch on one element after the other, from the lower left')):
-        command = commands.add_parser(
-            name, help=text, description=text)
+        command = commands.add_parser(name, help=text, description=text)
         command.add_argument('port', type=_port, metavar='PORT',
                              help='device such as /dev/ttyUSB0, or emulated')
         command.add_argument('--timeout', type=positive_float, default=0.1,

@@ -113,7 +113,7 @@ class DrawnPosterior:
         self._log_volume = np.log(volume) + self._log_area
 
     def draw(self, favoured: bool) -> Draw:
-        """Return the draws of a search; other surfaces may favour modes if `favoured` is given."""
+        """Return the draws of a search; if `favoured`, other surfaces may favour its modes."""
         sampling = self._sampling
         return Draw(sampling.largest_favoured if favoured else sampling.largest, self.fit)
 

@@ -486,8 +486,8 @@ def _report(
 
 def _parser() -> argparse.ArgumentParser:
     parser = arguments.ArgumentParser(
-        prog='demo', description='Start a network, every node as a process, and report on its '
-        'cycles.')
+        prog='demo',
+        description='Start a network, every node as a process, and report on its cycles.')
     add = parser.add_argument
     add('--users', type=arguments.integer(1, MAX_USERS), default=2, help='number of users')
     add('--cycles', type=arguments.positive_int, default=20, help='cycles to wait for')
