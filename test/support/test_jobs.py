@@ -4,19 +4,19 @@ import functools
 import importlib
 import io
 import json
-import linecache
 import os
+import queue
 import subprocess
 import sys
 import threading
 import time
-import types
 
 import numpy as np
 import pytest
 
 from rhs_isac_ros.experiments import Job, JobError, run_jobs
 from rhs_isac_ros.support import jobs as jobs_module
+from rhs_isac_ros.support import sources
 from rhs_isac_ros.support.jobs import Workers
 from rhs_isac_ros.support.optional import MissingLibraryError
 from rhs_isac_ros.support.plugins import ESTIMATORS, load
@@ -159,7 +159,7 @@ def test_results_of_other_sources_are_not_reused(tmp_path, monkeypatch, wrap):
         for name in ('helper', 'study'):
             monkeypatch.delitem(sys.modules, name, raising=False)
         importlib.invalidate_caches()
-        jobs_module._digest.cache_clear()
+        sources._digest.cache_clear()
         study = importlib.import_module('study')
         found += run_jobs(wrap(study.work), JOBS[:1], tmp_path / 'kept', n_jobs=1)
         found += study.calls
@@ -183,66 +183,6 @@ def test_a_plugin_that_an_argument_names_is_a_source(tmp_path, monkeypatch):
     assert found == [{'n': 1}, {'n': 2}]
 
 
-def test_a_function_without_a_module_in_a_file_is_a_source():
-    module = types.ModuleType('__main__')
-    texts = [f'def work():\n    return {number}\n' for number in (1, 2, 1)]
-    digests = []
-    for number, text in enumerate(texts):
-        linecache.cache[f'<cell {number}>'] = len(text), None, text.splitlines(True), ''
-        exec(compile(text, f'<cell {number}>', 'exec'), vars(module))
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setitem(sys.modules, '__main__', module)
-            digests.append(jobs_module.sources_of(module.work))
-    assert digests[0] == digests[2] != digests[1]
-
-
-@pytest.mark.parametrize('cells', [
-    ('k = 1', 'k = 2'), ('k = [1, {"a": 2}]', 'k = [1, {"a": 3}]'),
-    ('import numpy as np\nk = np.zeros(3000)', 'k[1500] = 1'),
-    ('def k(): return 1', 'def k(): return 2'),
-    ('k = lambda: helper()\nhelper = 1', 'helper = 2'),
-    ('class k:\n    def f(self): return 1', 'class k:\n    def f(self): return 2'),
-    ('class B:\n    f = property(lambda self: 1)\nclass k(B): pass\nk = k()',
-     'class B:\n    f = property(lambda self: 2)\nclass k(B): pass\nk = k()')])
-def test_what_a_function_without_a_file_uses_is_a_source(cells):
-    module = types.ModuleType('__main__')
-    digests = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(sys.modules, '__main__', module)
-        work = 'def work():\n    return {"all": [k for _ in range(2)]}'
-        for cell in (work, *cells, 'other = 1'):
-            exec(compile(cell, '<string>', 'exec'), vars(module))
-            digests.append(jobs_module.sources_of(module.work))
-    assert len({*digests}) == 3
-    assert digests[2] == digests[3]
-
-
-def test_values_bound_to_a_function_are_sources():
-    def of(value):
-        def work():
-            return {'value': value}
-        return work
-
-    class Work:
-        def __init__(self, value):
-            self.value = value
-
-        def __call__(self):
-            return {'value': self.value}
-
-    def of_two(value):
-        def work():
-            return {'value': value, 'other': not_yet}
-        if False:
-            not_yet = 1
-        return work
-    for wrap in (of, lambda value: functools.partial(print, end=value), Work, of_two,
-                 lambda value: Work(value).__call__):
-        one, other, same = (jobs_module.sources_of(wrap(value)) for value in (
-            np.arange(2000), np.arange(1, 2001), np.arange(2000)))
-        assert one == same != other
-
-
 def test_a_worker_with_a_module_from_before_an_edit_is_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, 'dont_write_bytecode', True)
     monkeypatch.syspath_prepend(tmp_path)
@@ -251,7 +191,7 @@ def test_a_worker_with_a_module_from_before_an_edit_is_an_error(tmp_path, monkey
         (tmp_path / 'old_lab.py').write_text(f'class Grid:\n    def n(self): return {text}\n')
         monkeypatch.delitem(sys.modules, 'old_lab', raising=False)
         importlib.invalidate_caches()
-        digests.append(jobs_module._code_of(importlib.import_module('old_lab')))
+        digests.append(sources.code_of(importlib.import_module('old_lab')))
         ends += [jobs_module.attempt(
             lambda: {'n': load(ESTIMATORS, 'old_lab:Grid')().n()}, Job('a', {}),
             modules={'old_lab': digest}) for digest in digests]
@@ -412,6 +352,26 @@ def test_a_process_that_dies_is_an_error(tmp_path):
 
     with pytest.raises(JobError, match='a process died'):
         run_jobs(work, JOBS, tmp_path, n_jobs=2)
+
+
+def test_a_run_that_ends_as_a_job_is_sent_shows_no_traceback(monkeypatch):
+    """joblib 1.6.0: processes that are killed before a call is seen end its thread."""
+    class Queue(queue.SimpleQueue):
+        n_left = 2
+
+        def get(self):
+            self.n_left -= 1
+            if not self.n_left:
+                raise KeyboardInterrupt
+            return super().get()
+
+    failed = []
+    monkeypatch.setattr(threading, 'excepthook', failed.append)
+    monkeypatch.setattr(jobs_module.queue, 'SimpleQueue', Queue)
+    for _ in range(5):
+        with pytest.raises(KeyboardInterrupt):
+            run_jobs(lambda number, of: {'square': number**2}, JOBS, n_jobs=2)
+    assert not failed
 
 
 def test_ctrl_c_ends_all_processes_and_the_run_resumes(tmp_path):
