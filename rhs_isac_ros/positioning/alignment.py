@@ -24,46 +24,38 @@ from rhs_isac_ros.support.threads import one_blas_thread
 # Smallest number of places of common users. A pose has six unknowns, and a place yields up to
 # three numbers.
 MIN_USERS = 10
-
-
-class _Limits(NamedTuple):
-    """Numbers that trade the speed of the search for a pose for its reliability."""
-
-    # Standard deviations by which mixtures are widened in successive steps [m]; from a pose in the
-    # neighbourhood of the first result, only the last ones.
-    widths_m: tuple[float, ...] = tuple((3.0 * 0.7**np.arange(16)).tolist())
-    near_widths: int = 5
-    # Number of poses in the neighbourhood, and their standard deviations [m] and [rad]. Positions
-    # have ambiguities half a metre apart, so the likelihood of a pose has several maxima.
-    near: int = 64
-    near_std: tuple[float, float] = (0.3, float(np.deg2rad(1.0)))
-    # Maximum number of steps with the mixtures as they are; they end when no element of the error
-    # changes by more than the second number [m] or [rad].
-    steps: int = 50
-    change: float = 1e-5
-    # Logarithm of the smallest probability of a candidate; others only cost time.
-    log_weight: float = -6.0
-    # Smallest share of a pair in the information; others only cost time.
-    share: float = 1e-9
-    # Maximum number of maxima around which errors are sampled, distance of maxima that are the
-    # same one [m] and [rad], number of samples of each, a power of two, and factor by which they
-    # are wider than a Gaussian.
-    maxima: int = 4
-    same: float = 1e-3
-    samples: int = 128
-    spread: float = 1.5
-    # Largest standard deviations of a result [m] and [rad]: beyond them, users do not determine
-    # the pose.
-    std_m: float = 2.0
-    std_rad: float = 0.2
-    # Smallest share of the apparent information about an error that is not due to the errors of
-    # the places.
-    certain: float = 0.5
-    # Squared Mahalanobis distance of users who are at one place.
-    same_place: float = 2.0
-
-
-_LIMITS = _Limits()
+# Standard deviations by which mixtures are widened in successive steps [m]; from a pose in the
+# neighbourhood of the first result, only the last ones.
+_WIDTHS_M = tuple((3.0 * 0.7**np.arange(16)).tolist())
+_NEAR_WIDTHS = 5
+# Number of poses in the neighbourhood, and their standard deviations [m] and [rad]. Positions have
+# ambiguities half a metre apart, so the likelihood of a pose has several maxima.
+_NEAR = 64
+_NEAR_STD = (0.3, float(np.deg2rad(1.0)))
+# Maximum number of steps with the mixtures as they are; they end when no element of the error
+# changes by more than the second number [m] or [rad].
+_STEPS = 50
+_CHANGE = 1e-5
+# Logarithm of the smallest probability of a candidate; others only cost time.
+_LOG_WEIGHT = -6.0
+# Smallest share of a pair in the information; others only cost time.
+_SHARE = 1e-9
+# Maximum number of maxima around which errors are sampled, distance of maxima that are the same
+# one [m] and [rad], number of samples of each, a power of two, and factor by which they are wider
+# than a Gaussian.
+_MAXIMA = 4
+_SAME = 1e-3
+_SAMPLES = 128
+_SPREAD = 1.5
+# Largest standard deviations of a result [m] and [rad]: beyond them, users do not determine the
+# pose.
+_STD_M = 2.0
+_STD_RAD = 0.2
+# Smallest share of the apparent information about an error that is not due to the errors of the
+# places.
+_CERTAIN = 0.5
+# Squared Mahalanobis distance of users who are at one place.
+_SAME_PLACE = 2.0
 # Information of a prior that keeps undetermined errors finite: 10 m and 1 rad.
 _PRIOR = np.diag(1 / np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])**2)
 # Cross products of the unit vectors, [3, 3, 3].
@@ -108,15 +100,15 @@ def estimate_pose(
         raise PoseError(f'sightings: {len(reference)} and {len(other)}, expected equal numbers, '
                         f'at least {MIN_USERS}')
     pairs = _Pairs.of(reference, other, bounds_m)
-    pose = pairs.climb(other[0].pose, _LIMITS.widths_m)[1]
+    pose = pairs.climb(other[0].pose, _WIDTHS_M)[1]
     pairs, n_places = pairs.by_place(pose)
     if n_places < MIN_USERS:
         raise PoseError(f'users: {n_places} places that differ by more than the errors of the '
                         f'positions, expected users at more different places, {MIN_USERS}')
-    near = [pairs.climb(pose.displaced(error), _LIMITS.widths_m[-_LIMITS.near_widths:])
-            for error in standard_normal(_LIMITS.near, 6) * np.repeat(_LIMITS.near_std, 3)]
+    near = [pairs.climb(pose.displaced(error), _WIDTHS_M[-_NEAR_WIDTHS:])
+            for error in standard_normal(_NEAR, 6) * np.repeat(_NEAR_STD, 3)]
     score, pose = max(near, key=lambda found: found[0].value)
-    if score.certain_share() < _LIMITS.certain:
+    if score.certain_share() < _CERTAIN:
         raise PoseError('users: they spread by less than the errors of their positions, except '
                         'along a line, expected users at more different places')
     mean, covariance = _moments(pairs, pose, near)
@@ -124,7 +116,7 @@ def estimate_pose(
     covariance = symmetric(covariance + covariance @ score.noise @ covariance)
     # Without any pair, the samples do not represent the likelihood.
     std = np.sqrt(np.diagonal(np.maximum(covariance, score.covariance())))
-    if not (std[:3].max() <= _LIMITS.std_m and std[3:].max() <= _LIMITS.std_rad):
+    if not (std[:3].max() <= _STD_M and std[3:].max() <= _STD_RAD):
         raise PoseError(
             f'users: standard deviations of the pose up to {std[:3].max():.2g} m and '
             f'{np.rad2deg(std[3:].max()):.2g} deg, expected users at more different places')
@@ -141,14 +133,14 @@ def _moments(pairs: '_Pairs', pose: Pose, found: Sequence[tuple['_Score', Pose]]
     components: list[tuple[float, np.ndarray, np.ndarray]] = []
     for score, maximum in found:
         error = pose.error_of(maximum)
-        if not any(np.abs(error - known).max() < _LIMITS.same for _, known, _ in components):
+        if not any(np.abs(error - known).max() < _SAME for _, known, _ in components):
             covariance = score.covariance()
             log_weight = score.value + np.linalg.slogdet(covariance)[1] / 2
             components.append((log_weight, error, covariance))
-    components = sorted(components, key=lambda one: -one[0])[:_LIMITS.maxima]
+    components = sorted(components, key=lambda one: -one[0])[:_MAXIMA]
     proposal = Mixture(*map(np.array, zip(*components, strict=True))).normalised()
-    proposal = proposal._replace(covariances=_LIMITS.spread**2 * proposal.covariances)
-    normal = standard_normal(_LIMITS.samples, 6)
+    proposal = proposal._replace(covariances=_SPREAD**2 * proposal.covariances)
+    normal = standard_normal(_SAMPLES, 6)
     errors = np.concatenate([mean + normal @ root.T for mean, root in zip(
         proposal.means, np.linalg.cholesky(proposal.covariances), strict=True)])
     density = proposal._replace(log_weights=np.zeros(len(components))).log_density(errors)
@@ -160,7 +152,7 @@ def _moments(pairs: '_Pairs', pose: Pose, found: Sequence[tuple['_Score', Pose]]
 def _candidates(sighting: Sighting) -> Mixture:
     """Return the probable candidates, normalised, in the frame of the surface."""
     mixture = sighting.likelihood.to_mixture(Pose()).normalised()
-    return select(mixture, mixture.log_weights >= _LIMITS.log_weight)
+    return select(mixture, mixture.log_weights >= _LOG_WEIGHT)
 
 
 def _inverses(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -240,18 +232,18 @@ class _Pairs(NamedTuple):
         while len(left):
             both, _ = _inverses(covariances[left] + covariances[left[0]])
             loss = likelihood_loss(places_m[left] - places_m[left[0]], both)
-            is_near = 2 * loss <= _LIMITS.same_place
+            is_near = 2 * loss <= _SAME_PLACE
             weights[left[is_near]] = 1 / np.count_nonzero(is_near)
             left, n_places = left[~is_near], n_places + 1
         return self._replace(weights=weights), n_places
 
     def climb(self, pose: Pose, widths_m: Sequence[float]) -> tuple[_Score, Pose]:
         """Return the nearest maximum of the likelihood, and the derivatives there."""
-        for width_m in (*widths_m, *(0.0,) * _LIMITS.steps):
+        for width_m in (*widths_m, *(0.0,) * _STEPS):
             score = self.score(pose, width_m)
             step = step_to_maximum(score.paired + _PRIOR, score.gradient)
             pose = pose.displaced(step)
-            if not width_m and np.abs(step).max() < _LIMITS.change:
+            if not width_m and np.abs(step).max() < _CHANGE:
                 break
         return self.score(pose, 0.0), pose
 
@@ -266,7 +258,7 @@ class _Pairs(NamedTuple):
         weights = shares * self.of_user.repeat(self.weights)
         lost = slopes.T @ (weights[:, None] * slopes) - (
             gradients.T @ (self.weights[:, None] * gradients))
-        (likely,) = np.nonzero(shares > _LIMITS.share)
+        (likely,) = np.nonzero(shares > _SHARE)
         places_m, covariances = self._places(likely, offsets, precisions)
         weights, precisions = weights[likely], precisions[likely]
         crosses = cross(np.eye(3), (places_m - pose.origin)[:, None])

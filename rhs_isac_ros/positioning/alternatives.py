@@ -53,48 +53,38 @@ _MIN_PROBABILITY = 1e-12
 _FAR_M = 1e7
 # Smallest probability of an alternative that is reported.
 _MIN_DOUBT = 0.01
-
-
-class OutsideGrid(NamedTuple):
-    """Extent and resolution of the grid of positions outside of the region."""
-
-    # In units of the nearest range of the region: width of the border around the region that does
-    # not count as outside, and nearest range, which is at least a multiple of the radius of the
-    # aperture.
-    border: float = 0.1
-    nearest: float = 0.3
-    apertures: float = 4.0
-    # Farthest range in units of the farthest range of the region, and ratio of successive ranges.
-    range_factor: float = 3.0
-    range_ratio: float = 1.15
-    # Phase error of a template at the edge of the aperture at which the next direction takes over,
-    # and largest number of templates. If this number would be exceeded, larger errors are
-    # accepted: large apertures distinguish more directions than a comparison of two hypotheses
-    # needs.
-    direction_rad: float = 0.25
-    templates: int = 40_000
-    # Largest phase error of a template at the ends of the ranges that share it [rad].
-    phase_error: float = 0.5
-    # Largest sine of the angle from boresight.
-    sine: float = 0.998
-    # Error of a residual due to the grid, as a share of the template's energy, and error of the
-    # gains of elements, as a share of a gain.
-    error: float = 0.25
-    gain_error: float = 0.01
-    # Directions with a log-likelihood below the best by more than this at all ranges are ignored.
-    margin: float = 20.0
-    # Numbers of templates, and of shots, to compute at a time.
-    block: int = 512
-    shots: int = 16
-    # Number of places to which sets of failed elements are fitted.
-    places: int = 24
-    # Sheets around places: numbers before and after a merger, and squared distance within one.
-    cells: int = 256
-    sheets: int = 32
-    apart: float = 3.0
-
-
-GRID = OutsideGrid()
+# In units of the nearest range of the region: width of the border around the region that does not
+# count as outside, and nearest range, which is at least a multiple of the radius of the aperture.
+_BORDER = 0.1
+_NEAREST = 0.3
+_APERTURES = 4.0
+# Farthest range in units of the farthest range of the region, and ratio of successive ranges.
+_RANGE_FACTOR = 3.0
+_RANGE_RATIO = 1.15
+# Phase error of a template at the edge of the aperture at which the next direction takes over, and
+# largest number of templates. If this number would be exceeded, larger errors are accepted: large
+# apertures distinguish more directions than a comparison of two hypotheses needs.
+_DIRECTION_RAD = 0.25
+_TEMPLATES = 40_000
+# Largest phase error of a template at the ends of the ranges that share it [rad].
+_PHASE_ERROR = 0.5
+# Largest sine of the angle from boresight.
+_SINE = 0.998
+# Error of a residual due to the grid, as a share of the template's energy, and error of the gains
+# of elements, as a share of a gain.
+_ERROR = 0.25
+_GAIN_ERROR = 0.01
+# Directions with a log-likelihood below the best by more than this at all ranges are ignored.
+_MARGIN = 20.0
+# Numbers of templates, and of shots, to compute at a time.
+_BLOCK = 512
+_SHOTS = 16
+# Number of places to which sets of failed elements are fitted.
+_PLACES = 24
+# Sheets around places: numbers before and after a merger, and squared distance within one.
+_CELLS = 256
+_SHEETS = 32
+_APART = 3.0
 
 
 class _Offsets(NamedTuple):
@@ -183,7 +173,7 @@ def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] 
     nodes, index = _template_ranges(scenario, ranges)
     weights = _prior(scenario, ranges, directions)
     points = _points(nodes, directions)
-    models = at_ranges(model, nodes, points.reshape(-1, 3), GRID.gain_error)
+    models = at_ranges(model, nodes, points.reshape(-1, 3), _GAIN_ERROR)
     basis, shape = models[0].basis, (model.shape[0], *points.shape[:2])
     filters = np.empty((*shape, basis.shape[2]), np.complex64)
     energy = np.empty(shape[1:], np.float32)
@@ -197,7 +187,7 @@ def tabulate_outside(model: MeasurementModel, progress: Callable[[float], None] 
         energy[part] = np.sum(np.abs(templates)**2, axis=(0, 2))
 
     map_blocks(fill, list(itertools.product(
-        range(len(nodes)), blocks(len(directions), GRID.block))), progress)
+        range(len(nodes)), blocks(len(directions), _BLOCK))), progress)
     return {
         'outer_filters': filters.reshape(shape[0], -1, basis.shape[2]),
         'outer_basis': basis,
@@ -318,7 +308,7 @@ class _Templates:
         divides by the gain.
         """
         return np.concatenate([self._log_evidence(whitened[block], prior)
-                               for block in blocks(len(whitened), GRID.shots)])
+                               for block in blocks(len(whitened), _SHOTS)])
 
     def _log_evidence(self, whitened: np.ndarray, prior: NuisancePrior) -> np.ndarray:
         shot, _, _, logs, largest = self._cells(whitened, prior)
@@ -338,7 +328,7 @@ class _Templates:
         explained = (np.sum(filtered, axis=1)**2 / self._node_energy).max(axis=1)
         rest = np.maximum(energy[:, None] - explained, n * _MIN_PROBABILITY)
         bound, _ = _best_gain(prior, np.zeros_like(rest), rest, n)
-        shot, direction = marked(bound >= bound.max(axis=1, keepdims=True) - GRID.margin)
+        shot, direction = marked(bound >= bound.max(axis=1, keepdims=True) - _MARGIN)
         of_shot, n_bands = Segments.of_keys(shot), filtered.shape[1]
         # With the P pairs of a shot and a direction last, reductions over ranges are fast.
         places = np.arange(filtered[0, ..., 0].size)[:, None] * filtered.shape[3]
@@ -358,7 +348,7 @@ class _Templates:
             arguments, total = arguments * factor, total * factor
         mean = of_shot.max(total.max(axis=0)) / n_bands
         largest = np.maximum(of_shot.max(highest.max(axis=0)), np.finfo(np.float32).min)
-        least = largest - GRID.margin - n_bands * (mean - gaussian.log_bessel(mean))
+        least = largest - _MARGIN - n_bands * (mean - gaussian.log_bessel(mean))
         (chosen,) = (highest >= of_shot.repeat(least)).ravel().nonzero()
         arguments = arguments.reshape(n_bands, -1).take(chosen, axis=1)
         ranges, pairs = np.divmod(chosen, len(shot))
@@ -381,7 +371,7 @@ class _Templates:
         """Return whether some position explains the signals up to this residual energy."""
         amplitude = np.sum(self._filter(whitened[None])[0], axis=0)[self._index] * self._scale
         residual = self._state.energy(whitened) - amplitude + self._energy
-        tolerated = max_residual + GRID.error * self._energy
+        tolerated = max_residual + _ERROR * self._energy
         return bool(((residual <= tolerated) & np.isfinite(self._offset)).any())
 
     def places(self, whitened: np.ndarray, prior: NuisancePrior) -> tuple[np.ndarray, np.ndarray]:
@@ -392,34 +382,34 @@ class _Templates:
         likely, _ = _best_gain(
             prior, np.sum(np.abs(outputs), axis=0) * self._scale / 2, energy, whitened.size)
         likely = likely + self._offset
-        half, parts = GRID.range_ratio**0.5, []
-        for index in np.argsort(-likely, axis=None)[:GRID.places]:
+        half, parts = _RANGE_RATIO**0.5, []
+        for index in np.argsort(-likely, axis=None)[:_PLACES]:
             place = np.unravel_index(index, likely.shape)
             centre_m = 2 / float(self._scale[place[0], 0])
             range_m = np.arange(centre_m / half, centre_m * half, radii[0] / 3)
             turned = outputs[:, place[0], place[1], None] * np.exp(
                 1j * self._carriers[:, None] * range_m) / range_m
             value, gain = _best_gain(prior, prior.amplitude(turned), energy, whitened.size)
-            order = np.argsort(-value)[:GRID.places]
+            order = np.argsort(-value)[:_PLACES]
             points = np.column_stack([range_m[order], np.broadcast_to(
                 self._directions[place[1]], (len(order), 2))])
             parts.append((value[order] - self._energy[place], points, prior.start(
                 turned[:, order], np.broadcast_to(gain, value.shape)[order])))
         value, points, values = map(np.concatenate, zip(*parts, strict=True))
         order = np.argsort(-value, kind='stable')
-        order = order[separate(np.zeros(len(order), int), points[order], radii)][:GRID.places]
+        order = order[separate(np.zeros(len(order), int), points[order], radii)][:_PLACES]
         return points[order], values[order]
 
     def sheets(self, whitened: np.ndarray, prior: NuisancePrior) -> Sheets:
         """Merge the cells of the grid with the most mass; see `Outside.sheets`."""
         _, ranges, directions, logs, _ = self._cells(whitened[None], prior)
-        chosen = np.argsort(-logs, kind='stable')[:GRID.cells]
+        chosen = np.argsort(-logs, kind='stable')[:_CELLS]
         range_m = 2 / self._scale[ranges[chosen], 0].astype(float)
         extents = np.empty((len(chosen), 3))
-        extents[:, 0], extents[:, 1:] = range_m * math.log(GRID.range_ratio), self._spacing
+        extents[:, 0], extents[:, 1:] = range_m * math.log(_RANGE_RATIO), self._spacing
         points = np.column_stack([range_m, self._directions[directions[chosen]]])
         return Sheets._make((logs[chosen] - log_sum(logs), points, extents[:, None]**2 / 12
-                             * np.eye(3))).reduce(GRID.sheets, GRID.apart)
+                             * np.eye(3))).reduce(_SHEETS, _APART)
 
     def _filter(self, whitened: np.ndarray) -> np.ndarray:
         """Return filter output magnitudes by template and direction, [N, N_B, T, V] [m]."""
@@ -535,28 +525,28 @@ def _best_gain(prior: NuisancePrior, amplitude: np.ndarray, energy: np.ndarray, 
 
 def farthest_range_m(scenario: Scenario) -> float:
     """Return the largest range of users outside."""
-    return GRID.range_factor * float(Resolution.of(scenario).farthest_m)
+    return _RANGE_FACTOR * float(Resolution.of(scenario).farthest_m)
 
 
 def _ranges(scenario: Scenario) -> np.ndarray:
     """Return the ranges of the grid in geometric progression, float64 [R] [m]."""
     resolution = Resolution.of(scenario)
     aperture_m = np.linalg.norm(element_positions(scenario), axis=1).max()
-    nearest_m = max(GRID.nearest * resolution.nearest_m, GRID.apertures * aperture_m)
+    nearest_m = max(_NEAREST * resolution.nearest_m, _APERTURES * aperture_m)
     ratio = farthest_range_m(scenario) / nearest_m
-    n_ranges = 1 + max(1, int(np.ceil(np.log(ratio) / np.log(GRID.range_ratio))))
-    return nearest_m * GRID.range_ratio**np.arange(n_ranges)
+    n_ranges = 1 + max(1, int(np.ceil(np.log(ratio) / np.log(_RANGE_RATIO))))
+    return nearest_m * _RANGE_RATIO**np.arange(n_ranges)
 
 
 def _directions(scenario: Scenario) -> np.ndarray:
     """Return direction cosines (u, v) over the half space, float64 [V, 2]."""
     direction = Resolution.of(scenario).direction
     n_ranges = len(_template_ranges(scenario, _ranges(scenario))[0])
-    fewest = np.sqrt(np.pi / 4 * n_ranges / (np.prod(direction) * GRID.templates))
-    counts = np.ceil(0.5 / (max(GRID.direction_rad, fewest) * direction)).astype(int)
+    fewest = np.sqrt(np.pi / 4 * n_ranges / (np.prod(direction) * _TEMPLATES))
+    counts = np.ceil(0.5 / (max(_DIRECTION_RAD, fewest) * direction)).astype(int)
     lines = [(np.arange(2 * n) + 0.5) / n - 1 for n in counts.tolist()]
     grid = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1).reshape(-1, 2)
-    return grid[np.hypot(*grid.T) < GRID.sine]
+    return grid[np.hypot(*grid.T) < _SINE]
 
 
 def _points(ranges: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -571,7 +561,7 @@ def _prior(scenario: Scenario, ranges: np.ndarray, directions: np.ndarray) -> np
     positions = to_positions(_points(ranges, directions))
     distance = np.linalg.norm(positions - np.clip(positions, *scenario.roi_bounds_m), axis=-1)
     solid_angle = 1 / np.sqrt(1 - np.sum(directions**2, axis=1))
-    border_m = GRID.border * Resolution.of(scenario).nearest_m
+    border_m = _BORDER * Resolution.of(scenario).nearest_m
     weights = np.where(distance > border_m, ranges[:, None] * solid_angle, 0.0)
     total = weights.sum()
     return weights / total if total > 0 else weights
@@ -593,7 +583,7 @@ def _template_ranges(scenario: Scenario, ranges: np.ndarray) -> tuple[np.ndarray
         ends_m, node_m = ranges[[first, end - 1]], midway(first, end)
         errors = (resolution.curvature_m * np.abs(1 / ends_m - 1 / node_m)
                   + np.abs(ends_m - node_m) / resolution.delay_m)
-        return bool(errors.max() <= GRID.phase_error)
+        return bool(errors.max() <= _PHASE_ERROR)
 
     shared = Segments.as_long_as(fits, len(ranges))
     return (midway(shared.starts, shared.ends),

@@ -24,22 +24,15 @@ from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.positioning.templates import standard_normal
 
-
-class _Limits(NamedTuple):
-    """Numbers that trade the speed of products for their accuracy."""
-
-    # Largest number of products, and decrease of the logarithm of their masses.
-    products: int = 256
-    margin: float = 15.0
-    samples: int = 16
-    # Numbers of ranges and directions of the points that represent a surface's prior.
-    ranges: int = 32
-    directions: int = 64
-    # Smallest share of a likelihood that is a constant or beyond a region.
-    least: float = 1e-9
-
-
-_LIMITS = _Limits()
+# Largest number of products, and decrease of the logarithm of their masses.
+_PRODUCTS = 256
+_MARGIN = 15.0
+_SAMPLES = 16
+# Numbers of ranges and directions of the points that represent a surface's prior.
+_RANGES = 32
+_DIRECTIONS = 64
+# Smallest share of a likelihood that is a constant or beyond a region.
+_LEAST = 1e-9
 _AT_SURFACE = Pose()
 
 
@@ -55,7 +48,7 @@ def places_of(outside: Sheets, log_ratio: float, scenario: Scenario) -> Places:
     log_prior = _log_prior(places.means, pose, farthest_m) - _log_mass(own)
     known = np.isfinite(log_prior)
     log_rest = log_ratio + float(np.log(max(
-        1 - np.exp(places.log_weights[known]).sum(), _LIMITS.least)))
+        1 - np.exp(places.log_weights[known]).sum(), _LEAST)))
     return Places(
         select(places.weighted(log_ratio - np.where(known, log_prior, 0.0)), known), log_rest,
         farthest_m, log_size(scenario.roi_bounds_m))
@@ -79,7 +72,7 @@ def log_evidence(sightings: Sequence[Sighting], log_shares: Sequence[float],
                         bounds_m=bounds_m)
     logs = prior.log_density(positions)
     total = np.logaddexp.reduce(
-        (product.rows.log_weights[:, None] + logs).ravel()) - np.log(_LIMITS.samples)
+        (product.rows.log_weights[:, None] + logs).ravel()) - np.log(_SAMPLES)
     return float(np.logaddexp(constant, total))
 
 
@@ -97,7 +90,7 @@ def _factor(sighting: Sighting, log_share: float, bounds_m: np.ndarray) -> _Fact
     if places is None:
         # In the part of the region of the surface that is outside of that of the site.
         log_rest = float(np.logaddexp(np.nan_to_num(sighting.outside_log_ratio), np.log(
-            max(-np.expm1(log_share), _LIMITS.least))))
+            max(-np.expm1(log_share), _LEAST))))
     else:
         inside = sighting.mixture.position().normalised().weighted(places.log_volume)
         log_rest, found = places.log_rest, concatenate(inside, places.gaussians)
@@ -110,10 +103,10 @@ def _times(one: _Factor, other: _Factor) -> _Factor:
     """Multiply two likelihoods; keep the heaviest products."""
     parts = [one.rows.weighted(other.log_constant), other.rows.weighted(one.log_constant)]
     if len(one.rows.means) and len(other.rows.means):
-        first, second = one.rows.heaviest_pairs(other.rows, _LIMITS.products, _LIMITS.margin)
+        first, second = one.rows.heaviest_pairs(other.rows, _PRODUCTS, _MARGIN)
         parts.append(select(one.rows, first).updated(select(other.rows, second)))
     rows = concatenate(*parts)
-    heaviest = np.argsort(-rows.log_weights, kind='stable')[:_LIMITS.products]
+    heaviest = np.argsort(-rows.log_weights, kind='stable')[:_PRODUCTS]
     return _Factor(select(rows, heaviest), one.log_constant + other.log_constant)
 
 
@@ -121,7 +114,7 @@ def _samples(mixture: Mixture) -> np.ndarray:
     """Return positions of each of C components, float64 [C, S, 3] [m]."""
     roots = np.linalg.cholesky(regular(mixture.covariances))
     return mixture.means[:, None] + np.matmul(
-        standard_normal(_LIMITS.samples), np.swapaxes(roots, 1, 2))
+        standard_normal(_SAMPLES), np.swapaxes(roots, 1, 2))
 
 
 def _is_outside(positions: np.ndarray, bounds_m: np.ndarray) -> np.ndarray:
@@ -157,13 +150,13 @@ class _Prior(NamedTuple):
 @functools.lru_cache
 def _log_mass(prior: _Prior) -> float:
     """Return the logarithm of the mass of a prior before it is normalised."""
-    sight = standard_normal(_LIMITS.directions) * 1.0
+    sight = standard_normal(_DIRECTIONS) * 1.0
     sight[:, 0] = np.abs(sight[:, 0])
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-    shares = (np.arange(_LIMITS.ranges) + 0.5) / _LIMITS.ranges
+    shares = (np.arange(_RANGES) + 0.5) / _RANGES
     seen = [np.isfinite(prior._log_mean(pose.to_site(farthest_m * shares[:, None, None] * sight)))
             for pose, farthest_m in prior.surfaces]
-    return float(np.log(max(np.mean(seen), _LIMITS.least)))
+    return float(np.log(max(np.mean(seen), _LEAST)))
 
 
 def _log_prior(positions: np.ndarray, pose: Pose, farthest_m: float) -> np.ndarray:

@@ -32,27 +32,19 @@ from rhs_isac_ros.positioning.estimate import Estimate
 WINDOW = 400
 MIN_RETURN = 100
 MIN_RESIDUALS = 10
-
-
-class _Limits(NamedTuple):
-    """Limits of an `InnovationTest`: those of the mean of the residuals and of their variance."""
-
-    # Probabilities that the residuals of a correct model cause a warning. For the variance, the
-    # approximation is less accurate.
-    begin: tuple[float, float] = (1e-6, 1e-7)
-    # A warning ends when the p-values of the latest residuals reach these. They are high, so that
-    # a small deviation does not cause one warning after another.
-    end: tuple[float, float] = (0.9, 0.5)
-    # Tolerated error of an expectation, and tolerated relative excess of the variance. Modes that
-    # are not Gaussian cause both.
-    tolerances: tuple[float, float] = (0.5, 0.15)
-    # Limits of a residual's deviation, in standard deviations, and of its square. The first keeps
-    # a single signal from causing a warning, and the second keeps a few from dominating.
-    deviation: float = 6.0
-    square: float = 9.0
-
-
-_LIMITS = _Limits()
+# Probabilities that the residuals of a correct model cause a warning. For the variance, the
+# approximation is less accurate.
+_BEGIN = 1e-6, 1e-7
+# A warning ends when the p-values of the latest residuals reach these. They are high, so that a
+# small deviation does not cause one warning after another.
+_END = 0.9, 0.5
+# Tolerated error of an expectation, and tolerated relative excess of the variance. Modes that are
+# not Gaussian cause both.
+_TOLERANCES = 0.5, 0.15
+# Limits of a residual's deviation, in standard deviations, and of its square. The first keeps a
+# single signal from causing a warning, and the second keeps a few from dominating.
+_DEVIATION = 6.0
+_SQUARE = 9.0
 # Subjects with which reasons begin.
 _ENERGY = 'energy of the signals'
 _RESIDUAL = 'residual energy at the best position'
@@ -161,11 +153,11 @@ class InnovationTest:
         self._residuals.append(_terms(energy / self._median, expected, self._std_db))
         if self.drifts:
             latest = list(self._residuals)[-MIN_RETURN:]
-            if len(latest) == MIN_RETURN and _fit(latest, _LIMITS.end):
+            if len(latest) == MIN_RETURN and _fit(latest, _END):
                 self.clear()
                 self._residuals.extend(latest)
         elif len(self._residuals) >= MIN_RESIDUALS:
-            self.drifts = not _fit(self._residuals, _LIMITS.begin)
+            self.drifts = not _fit(self._residuals, _BEGIN)
 
     @property
     def n_residuals(self) -> int:
@@ -213,13 +205,13 @@ def _terms(energy: float, expected: float, level_std_db: float) -> tuple[_Sum, _
     share = gaussian.share_of_level(scale, level_std_db)
     shape = scale * (1 - share)
     std = scale / shape**0.5
-    deviation = min(max((energy - expected) / std, -_LIMITS.deviation), _LIMITS.deviation)
+    deviation = min(max((energy - expected) / std, -_DEVIATION), _DEVIATION)
     own_variance = max(expected, 0.0)
     # The square of a normalised gamma variable of shape k has the mean 1 and this variance.
     square_variance = 2 + 6 / shape
     return (_Sum(1, expected + deviation * std, expected, own_variance,
                  (own_variance * share / (1 - share))**0.5),
-            _Sum(1, min(deviation**2, _LIMITS.square), 1.0, square_variance * (1 - share**2),
+            _Sum(1, min(deviation**2, _SQUARE), 1.0, square_variance * (1 - share**2),
                  square_variance**0.5 * share))
 
 
@@ -236,7 +228,7 @@ def _p_value_of_mean(total: _Sum) -> float:
     from scipy.special import gammainc, gammaincc
 
     # With few measurements and many modes, an expectation may be negative.
-    expected, slack = max(total.expected, 0.5 * total.n), _LIMITS.tolerances[0] * total.n
+    expected, slack = max(total.expected, 0.5 * total.n), _TOLERANCES[0] * total.n
     shape = expected**2 / max(total.variance, 0.5 * total.n)
     low, high = (shape / expected * (total.value + sign * slack) for sign in (-1, 1))
     return 2 * float(min(gammainc(shape, high), gammaincc(shape, max(low, 0.0))))
@@ -246,7 +238,7 @@ def _p_value_of_spread(total: _Sum) -> float:
     """Return the one-sided p-value of a sum of squared deviations, nearly a gamma variable."""
     from scipy.special import gammaincc
 
-    tolerated = 1 + _LIMITS.tolerances[1]
+    tolerated = 1 + _TOLERANCES[1]
     mean, variance = total.expected * tolerated, total.variance * tolerated**2
     return float(gammaincc(mean**2 / variance, max(total.value, 0.0) * mean / variance))
 

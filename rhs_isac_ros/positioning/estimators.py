@@ -62,31 +62,23 @@ from rhs_isac_ros.support.fields import Field, finite
 from rhs_isac_ros.support.threads import map_blocks, one_blas_thread
 from rhs_isac_ros.system import System
 
-
-class _Limits(NamedTuple):
-    """Numbers of shots and samples, and when a residual counts."""
-
-    # Number of shots that are located together.
-    block: int = 128
-    # Samples per mode if the phases of the bands carry information, and if modes are narrow. In
-    # the first case, the density has several peaks within a mode, and a few of the samples carry
-    # most of the weight.
-    informative: int = 512
-    moving: int = 128
-    narrow: int = 64
-    # Total probability of the alternatives above which residuals are not compared with the
-    # scenario.
-    doubt: float = 0.05
-    # Log odds of an alternative below which averages over surfaces leave no doubt.
-    clear: float = -3.0
-    # Number of modes of the average over surfaces, which only shows whether there is a doubt. The
-    # others contain 1 % of its evidence.
-    averaged: int = 32
-    # Growth of errors on the grid, see `NuisancePrior.growth`, above which it is searched again.
-    noisier: float = 8.0
-
-
-_LIMITS = _Limits()
+# Number of shots that are located together.
+_BLOCK = 128
+# Samples per mode if the phases of the bands carry information, and if modes are narrow. In the
+# first case, the density has several peaks within a mode, and a few of the samples carry most of
+# the weight.
+_INFORMATIVE = 512
+_MOVING = 128
+_NARROW = 64
+# Total probability of the alternatives above which residuals are not compared with the scenario.
+_DOUBT = 0.05
+# Log odds of an alternative below which averages over surfaces leave no doubt.
+_CLEAR = -3.0
+# Number of modes of the average over surfaces, which only shows whether there is a doubt. The
+# others contain 1 % of its evidence.
+_AVERAGED = 32
+# Growth of errors on the grid, see `NuisancePrior.growth`, above which it is searched again.
+_NOISIER = 8.0
 
 
 class SearchEstimator(abc.ABC):
@@ -155,10 +147,10 @@ class SearchEstimator(abc.ABC):
         # Points that represent a standard Gaussian, float64 [128, 3].
         self.normal = standard_normal(N_NORMAL) if lazy else self._region.table.normal
         self._mode_normal = (
-            standard_normal(_LIMITS.informative, 3 + 3 * bool(prior.velocity.size))
+            standard_normal(_INFORMATIVE, 3 + 3 * bool(prior.velocity.size))
             if self._phases.is_informative
-            else standard_normal(_LIMITS.moving, 6) if prior.velocity.size
-            else self.normal if prior.is_coarse else self.normal[:_LIMITS.narrow])
+            else standard_normal(_MOVING, 6) if prior.velocity.size
+            else self.normal if prior.is_coarse else self.normal[:_NARROW])
 
     @functools.cached_property
     def _region(self) -> SearchScope:
@@ -232,7 +224,7 @@ class SearchEstimator(abc.ABC):
                                          ('n_before', n_before, 0.0)):
                 if value != default:
                     raise ValueError(f'{name}: {value}, expected together with a prior')
-            found = [one.posterior() for block in blocks(len(signals.received), _LIMITS.block)
+            found = [one.posterior() for block in blocks(len(signals.received), _BLOCK)
                      for one in self._locate_block(self._region, select(signals, block))]
         else:
             if not 0 < finite('wrong', wrong) < 1:
@@ -314,7 +306,7 @@ class SearchEstimator(abc.ABC):
         `constant`, [3, 3] [m^2], is the covariance of further errors, which all phases share.
         """
         density, mixture = priors.inside(
-            density, self._bounds, self.normal[:_LIMITS.narrow], self.scenario.pose)
+            density, self._bounds, self.normal[:_NARROW], self.scenario.pose)
         pose = self.scenario.pose
         return dataclasses.replace(
             estimate.described(mixture.shared(constant), pose),
@@ -329,7 +321,7 @@ class SearchEstimator(abc.ABC):
         return itertools.chain.from_iterable(map_blocks(
             lambda block: [one.estimate for one in self._locate_block(
                 self._region, select(signals, block))],
-            blocks(len(batch), _LIMITS.block)))
+            blocks(len(batch), _BLOCK)))
 
     def _locate_block(self, scope: SearchScope, signals: Signals, draws: bool = True
                       ) -> list['_Found']:
@@ -388,7 +380,7 @@ class SearchEstimator(abc.ABC):
         growth = prior.growth(best.first(modes.values) @ prior.gain)
         parts = [modes]
         # The margin of users who move does not depend on the scope.
-        for place in np.flatnonzero((growth > _LIMITS.noisier) & (not prior.velocity.size)):
+        for place in np.flatnonzero((growth > _NOISIER) & (not prior.velocity.size)):
             shot = int(modes.shots[best.starts[place]])
             starts = scope.table.starts(
                 whitened[[shot]], prior,
@@ -409,7 +401,7 @@ class SearchEstimator(abc.ABC):
         if scope.alternatives and not isinstance(self._refinement, OneState):
             # The margin of the refinement admits modes that count only for some states.
             averaged = self._samples(*self._averaging.refine(likely_modes(
-                coarse, _LIMITS.averaged), signals, scope.table), signals)
+                coarse, _AVERAGED), signals, scope.table), signals)
         means, covariances = self._moments(modes, samples)
         # If the model holds, twice the residual energy, averaged over the posterior, has the mean
         # of a chi-square variable. At the best of several modes, it is smaller than the average.
@@ -461,7 +453,7 @@ class SearchEstimator(abc.ABC):
         for one in alternatives:
             ratios, values, seen = log_ratios_of(
                 one, self._likelihood, signals, seen, aligned, shadow, in_sight)
-            for n in np.flatnonzero((gains > 0) & (one.log_odds + ratios > _LIMITS.clear)):
+            for n in np.flatnonzero((gains > 0) & (one.log_odds + ratios > _CLEAR)):
                 points, parameters, level = one.places(seen[n], prior)
                 ratios[n] += self._refinement.gain(points, parameters + values[n], Signals(*(
                     each / level for each in select(signals, [n])))) - gains[n]
@@ -486,7 +478,7 @@ class SearchEstimator(abc.ABC):
         # Without a fix, only a residual that nothing explains is evidence against the scenario.
         # The residual is the reason if the texts are equal.
         is_evidence = (reason == self._test.residual_test(fit.residual) if reason
-                       else probabilities[0] >= 1 - _LIMITS.doubt)
+                       else probabilities[0] >= 1 - _DOUBT)
         statistics: dict[str, Any] = {
             'residual': fit.residual, 'expected_residual': fit.expected if is_evidence else np.nan,
             **{f'{one.name}_probability': float(share) for one, share in zip(

@@ -55,43 +55,34 @@ _EXTENSION_BYTES, _BLOCK_BYTES = 1 << 26, 1 << 24
 _ANYWHERE_M = np.array([[0.0, -2e7, -2e7], [2e7, 2e7, 2e7]])
 # Number of places at which all elements are compared at a time.
 _PLACES = 8
-
-
-class FailureLimits(NamedTuple):
-    """Numbers that trade the speed of the search for sets for the completeness of its result."""
-
-    # The residual of an intact surface exceeds the usual residual with this probability. If the
-    # observed residual does not exceed it, sets grow from this number of modes.
-    unusual: float = 0.01
-    usual_modes: int = 2
-    # If it does: largest number of grid points besides the modes, their margin, and number of
-    # places.
-    points: int = 64
-    point_margin: float = 30.0
-    places: int = 64
-    # Factor of the share of further failures while sets are ranked.
-    remainder: float = 0.3
-    # Number of hypotheses to extend, in all, of the same set, and of the same place.
-    extended: int = 16
-    per_set: int = 3
-    per_place: int = 4
-    # Number of extended hypotheses to weigh exactly.
-    exact: int = 16
-    # Largest number of elements by which a set grows.
-    growth: int = 6
-    # Number of sets to try at all places.
-    tried_everywhere: int = 4
-    # Hypotheses are dropped if their log-probability is below the best by more than these margins,
-    # before and during the exact steps.
-    margin: float = 9.0
-    step_margin: float = 27.0
-    # Largest number of hypotheses to keep.
-    hypotheses: int = 48
-    # Number of exact steps.
-    steps: int = 2
-
-
-LIMITS = FailureLimits()
+# The residual of an intact surface exceeds the usual residual with this probability. If the
+# observed residual does not exceed it, sets grow from this number of modes.
+_UNUSUAL = 0.01
+_USUAL_MODES = 2
+# If it does: largest number of grid points besides the modes, their margin, and number of places.
+_POINTS = 64
+_POINT_MARGIN = 30.0
+_SEARCHED = 64
+# Factor of the share of further failures while sets are ranked.
+_REMAINDER = 0.3
+# Number of hypotheses to extend, in all, of the same set, and of the same place.
+_EXTENDED = 16
+_PER_SET = 3
+_PER_PLACE = 4
+# Number of extended hypotheses to weigh exactly.
+_EXACT = 16
+# Largest number of elements by which a set grows.
+_GROWTH = 6
+# Number of sets to try at all places.
+_TRIED_EVERYWHERE = 4
+# Hypotheses are dropped if their log-probability is below the best by more than these margins,
+# before and during the exact steps.
+_MARGIN = 9.0
+_STEP_MARGIN = 27.0
+# Largest number of hypotheses to keep.
+_HYPOTHESES = 48
+# Number of exact steps.
+_STEPS = 2
 
 # A set of failed elements in ascending order, and a hypothesis: a set with the index of a place.
 Failed: TypeAlias = tuple[int, ...]
@@ -147,7 +138,7 @@ class FailedElements:
         modes, _ = self._modes(search, self._elsewhere, signals)
         averaged = ascend(
             self._average, self._elsewhere, Starts(np.zeros(len(points), int), points, values),
-            signals, LIMITS.steps, LIMITS.step_margin)
+            signals, _STEPS, _STEP_MARGIN)
         return max(modes.log_mass - averaged.log_mass, 0.0)
 
     def _search(self, modes: Modes, signals: Signals, table: TemplateTable) -> 'FailureSearch':
@@ -160,41 +151,41 @@ class FailedElements:
             aligned = modes.values[order[0]] * self._likelihood.nuisance.moves_multipath
             found = table.starts(
                 self._likelihood.whitened(aligned, signals), self._likelihood.nuisance,
-                LIMITS.point_margin)
-            search.add(found.points[:LIMITS.points], found.values[:LIMITS.points] + aligned)
+                _POINT_MARGIN)
+            search.add(found.points[:_POINTS], found.values[:_POINTS] + aligned)
         self._grow(search, keys)
         return search
 
     def _grow(self, search: 'FailureSearch', keys: list[Key]) -> None:
         """Grow sets at the best of the first places or, if none explains the signals, at all."""
         if search.explains(keys):
-            search.grow(keys[:LIMITS.usual_modes])
+            search.grow(keys[:_USUAL_MODES])
         else:
             chosen = first_places(
                 np.stack([place.point for place in search.places]),
                 self._likelihood.resolution.separation(self._likelihood.nuisance.is_coarse))
-            search.grow([((), index) for index in chosen], LIMITS.remainder)
+            search.grow([((), index) for index in chosen], _REMAINDER)
         search.try_neighbours(search.best)
 
     def _modes(self, search: 'FailureSearch', likelihood: Likelihood, signals: Signals
                ) -> tuple[Modes, Sequence[Conditional]]:
         """Return the modes of the probable sets of one shot, and the sets' likelihoods."""
         values, best = search.log_probabilities, max(search.log_probabilities.values())
-        keys = sorted((key for key in values if values[key] >= best - LIMITS.margin),
-                      key=lambda key: -values[key])[:LIMITS.hypotheses]
+        keys = sorted((key for key in values if values[key] >= best - _MARGIN),
+                      key=lambda key: -values[key])[:_HYPOTHESES]
         sets = list(dict.fromkeys(failed for failed, _ in keys))
         conditionals = [self._model.failed_set(failed) for failed in sets]
         parts = []
         for number, failed in enumerate(sets):
             # The most probable sets are tried at the other places, too.
-            places = search.places if number < LIMITS.tried_everywhere else [
+            places = search.places if number < _TRIED_EVERYWHERE else [
                 search.places[index] for one, index in keys if one == failed]
             starts = Starts(np.zeros(len(places), int), np.stack([one.point for one in places]),
                             np.stack([one.values for one in places]))
             parts.append(ascend(conditionals[number], likelihood, starts, signals,
-                                LIMITS.steps, LIMITS.step_margin, number))
+                                _STEPS, _STEP_MARGIN, number))
         modes = concatenate(*parts)
-        return select(modes, modes.order[:LIMITS.hypotheses]), conditionals
+        return select(modes, modes.order[:_HYPOTHESES]), conditionals
 
 
 def first_places(points: np.ndarray, radii: np.ndarray) -> list[int]:
@@ -209,8 +200,8 @@ def first_places(points: np.ndarray, radii: np.ndarray) -> list[int]:
     for index, cell in enumerate(map(tuple, np.floor(points[:, 1:] / radii[1:]).tolist())):
         turns[index] = seen[cell]
         seen[cell] += 1
-    turns[:LIMITS.places // 2] = -1
-    return np.argsort(turns, kind='stable')[:LIMITS.places].tolist()
+    turns[:_SEARCHED // 2] = -1
+    return np.argsort(turns, kind='stable')[:_SEARCHED].tolist()
 
 
 class FailedSurface(NamedTuple):
@@ -506,12 +497,12 @@ class FailureSearch:
     the first element added would often be a third one that imitates the sum of both.
 
     Growth ends when all new sets are less probable than the best set by a margin, and the deviance
-    of some hypothesis is as low as usual, or else after `FailureLimits.growth` elements.
+    of some hypothesis is as low as usual, or else after `_GROWTH` elements.
     """
 
     def __init__(self, model: FailureModel, signals: Signals) -> None:
         self._model, self._signals = model, signals
-        self._usual = energy_limit(int(np.prod(model.likelihood.model.shape)), LIMITS.unusual)
+        self._usual = energy_limit(int(np.prod(model.likelihood.model.shape)), _UNUSUAL)
         self.places: list[Place] = []
         # Logarithm of prior times likelihood of each hypothesis.
         self.log_probabilities: dict[Key, float] = {}
@@ -539,13 +530,13 @@ class FailureSearch:
         """
         # Earlier growth does not count: it may have ended with a set that is less probable.
         found = self._weigh(parents)
-        for _ in range(LIMITS.growth):
+        for _ in range(_GROWTH):
             ranked = self._weigh_children(parents, remainder)
             if not ranked:
                 # All elements have failed.
                 break
-            exact = self._weigh(ranked[:LIMITS.exact])
-            limit = max(self.log_probabilities[key] for key in found) - LIMITS.margin
+            exact = self._weigh(ranked[:_EXACT])
+            limit = max(self.log_probabilities[key] for key in found) - _MARGIN
             if self.log_probabilities[exact[0]] < limit and self.explains(found):
                 break
             found += exact
@@ -557,7 +548,7 @@ class FailureSearch:
         smaller = [tuple(sorted(set(failed) - {element})) for element in failed]
         self._weigh((one, index) for one in smaller)
         for parent in (failed, *smaller):
-            self._weigh(self._weigh_children([(parent, index)])[:LIMITS.exact])
+            self._weigh(self._weigh_children([(parent, index)])[:_EXACT])
 
     def _weigh(self, keys: Iterable[Key]) -> list[Key]:
         """Weigh hypotheses, and return them, the most probable first."""
@@ -590,9 +581,9 @@ def _diverse(ranked: list[Key]) -> list[Key]:
     """Choose the best hypotheses to extend, but only a few per set and per place."""
     chosen: list[Key] = []
     for failed, index in ranked:
-        if (sum(other == failed for other, _ in chosen) < LIMITS.per_set
-                and sum(other == index for _, other in chosen) < LIMITS.per_place):
+        if (sum(other == failed for other, _ in chosen) < _PER_SET
+                and sum(other == index for _, other in chosen) < _PER_PLACE):
             chosen.append((failed, index))
-        if len(chosen) == LIMITS.extended:
+        if len(chosen) == _EXTENDED:
             break
     return chosen

@@ -49,49 +49,42 @@ from rhs_isac_ros.positioning.templates import standard_normal
 from rhs_isac_ros.support.recent import Recent
 from rhs_isac_ros.support.threads import one_blas_thread
 
-
-class _Limits(NamedTuple):
-    """Numbers that trade the speed of a product for its accuracy; weights are logarithms."""
-
-    # Products below the best by more than this, and any beyond a number, are discarded: by the
-    # overlap of their sheets' moments, and after a Gauss-Newton step. Equal products, such as
-    # those of sheets at regular distances, must not be discarded.
-    margins: tuple[float, float] = (25.0, 12.0)
-    products: int = 4000
-    # Largest number of Gaussians of a posterior.
-    components: int = 512
-    # Numbers of samples of a sheet, smallest and largest one of a part of a product, and number of
-    # all parts together that are computed at a time. All products have the same few points, so
-    # that their errors do not average out.
-    of_sheet: int = 64
-    of_product: tuple[int, int] = (64, 256)
-    samples: int = 1 << 13
-    # Information of a uniform prior in the region that narrows Gaussians, as a share of it.
-    narrowing: float = 0.25
-    # Share of the samples that have to be effective in parts whose weight is within a margin of
-    # the best. Others are halved, this many at a time and so often.
-    effective: float = 0.35
-    margin: float = 5.0
-    parts: int = 32
-    halvings: int = 8
-    # Number of results of each kind that a `Fuser` keeps.
-    kept: int = 256
-    # Largest share of a variance that is the same in all phases.
-    constant: float = 0.98
-    # Logarithm of a likelihood of 0.
-    never: float = -1e9
-    # Logarithm of the largest value of sheets in the region, relative to their maxima, below which
-    # all of them are far from it.
-    far: float = -12.0
-    # Largest logarithm of an average that is due to the tails of sheets alone.
-    tail: float = -9.0
-    # Smallest logarithm of an average, relative to that of the constant.
-    least: float = -10.0
-    # Smallest extent of a region in its volume [m].
-    extent_m: float = 1e-3
-
-
-_LIMITS = _Limits()
+# Products whose log-weight is below the best by more than this, and any beyond a number, are
+# discarded: by the overlap of their sheets' moments, and after a Gauss-Newton step. Equal
+# products, such as those of sheets at regular distances, must not be discarded.
+_MARGINS = 25.0, 12.0
+_PRODUCTS = 4000
+# Largest number of Gaussians of a posterior.
+_COMPONENTS = 512
+# Numbers of samples of a sheet, smallest and largest one of a part of a product, and number of all
+# parts together that are computed at a time. All products have the same few points, so that their
+# errors do not average out.
+_OF_SHEET = 64
+_OF_PRODUCT = 64, 256
+_SAMPLES = 1 << 13
+# Information of a uniform prior in the region that narrows Gaussians, as a share of it.
+_NARROWING = 0.25
+# Share of the samples that have to be effective in parts whose log-weight is within a margin of
+# the best. Others are halved, this many at a time and so often.
+_EFFECTIVE = 0.35
+_MARGIN = 5.0
+_PARTS = 32
+_HALVINGS = 8
+# Number of results of each kind that a `Fuser` keeps.
+_KEPT = 256
+# Largest share of a variance that is the same in all phases.
+_CONSTANT = 0.98
+# Logarithm of a likelihood of 0.
+_NEVER = -1e9
+# Logarithm of the largest value of sheets in the region, relative to their maxima, below which all
+# of them are far from it.
+_FAR = -12.0
+# Largest logarithm of an average that is due to the tails of sheets alone.
+_TAIL = -9.0
+# Smallest logarithm of an average, relative to that of the constant.
+_LEAST = -10.0
+# Smallest extent of a region in its volume [m].
+_EXTENT_M = 1e-3
 _AT_SURFACE = Pose()
 
 
@@ -119,9 +112,9 @@ class Fuser:
         bounds_m = checked_bounds(bounds_m)
         self._bounds_m, self._outside_probability = bounds_m, outside_probability
         self._velocity_variance = velocity_variance(user_speed_std_mps, bounds_m)
-        self._factor = Recent(functools.partial(_Factor.of, bounds_m=bounds_m), _LIMITS.kept)
-        self._product = Recent(self._multiply, _LIMITS.kept)
-        self._fused = Recent(self._locate, _LIMITS.kept)
+        self._factor = Recent(functools.partial(_Factor.of, bounds_m=bounds_m), _KEPT)
+        self._product = Recent(self._multiply, _KEPT)
+        self._fused = Recent(self._locate, _KEPT)
 
     @one_blas_thread
     def fuse(self, sightings: Sequence[Sighting]) -> Estimate:
@@ -161,7 +154,7 @@ class Fuser:
 def _inside(sheets: Sheets, bounds_m: np.ndarray, pose: Pose, near: np.ndarray) -> Mixture:
     """Return averages and moments of sheets in a box, which contains positions near to them."""
     gaussians = sheets.inside(bounds_m, pose, near)
-    positions, log_ratio = gaussians.sample(standard_normal(_LIMITS.of_sheet))
+    positions, log_ratio = gaussians.sample(standard_normal(_OF_SHEET))
     return _moments(positions, gaussians.logarithm(positions) + log_ratio)
 
 
@@ -211,11 +204,11 @@ class _Factor(NamedTuple):
         # site, it is taken to be the same.
         log_average = inside.log_mass - _log_average(
             sighting.sheets, region_m) if sighting.sheets else float(heights.max())
-        is_far = heights.max() < _LIMITS.far
+        is_far = heights.max() < _FAR
         if is_far:
-            log_average = min(log_average, _LIMITS.tail)
+            log_average = min(log_average, _TAIL)
         # A product with the sheets remains if all of them are far from the region.
-        log_average = max(log_average, float(np.log(sighting.missing)) + _LIMITS.least)
+        log_average = max(log_average, float(np.log(sighting.missing)) + _LEAST)
         log_total = inside.log_mass - np.log1p(-sighting.missing) - log_average
         log_peaks, log_limit = sheets.log_peaks - log_total, np.inf
         if is_far:
@@ -233,8 +226,8 @@ class _Factor(NamedTuple):
                 np.append(inside.means, centre[None], axis=0),
                 np.append(inside.covariances, regular(np.diag(size**2 / 12))[None], axis=0))),
             # The region of the site may have no extent along an axis, and that of the surface one.
-            min(log_average + log_size(bounds_m, _LIMITS.extent_m)
-                - log_size(region_m, _LIMITS.extent_m), 0.0),
+            min(log_average + log_size(bounds_m, _EXTENT_M)
+                - log_size(region_m, _EXTENT_M), 0.0),
             -statistics.median([*curvature[:, 0, 0].tolist(), 0.0]))
 
     def term(self, chosen: np.ndarray) -> Term:
@@ -261,12 +254,12 @@ class _Products(NamedTuple):
         one, other = (mixture._replace(
             means=mixture.means[:, free], covariances=mixture.covariances[:, free][:, :, free])
             for mixture in (self.moments, last))
-        pairs = one.heaviest_pairs(other, _LIMITS.products, _LIMITS.margins[0])
+        pairs = one.heaviest_pairs(other, _PRODUCTS, _MARGINS[0])
         found = _Products(
             np.column_stack([self.rows[pairs[0]], pairs[1]]),
             select(self.moments, pairs[0]).updated(select(last, pairs[1])))
         return found.climbed(factors, bounds_m).heaviest(
-            _LIMITS.products, _LIMITS.margins[1], factors)
+            _PRODUCTS, _MARGINS[1], factors)
 
     def heaviest(self, number: int, margin: float, factors: Sequence[_Factor]) -> '_Products':
         """Return the heaviest products, and that of all constants if there are more factors."""
@@ -291,7 +284,7 @@ class _Products(NamedTuple):
     def climbed(self, factors: Sequence[_Factor], bounds_m: np.ndarray) -> '_Products':
         """Move to the maxima in the region by a Gauss-Newton step."""
         found, _ = self._single(factors)
-        prior = _LIMITS.narrowing * prior_information(bounds_m)
+        prior = _NARROWING * prior_information(bounds_m)
         for mine, terms in self._by_reference(factors):
             around = terms[0].pose
             place = np.clip(self.moments.means[mine], *bounds_m)
@@ -352,17 +345,17 @@ class _Products(NamedTuple):
         owners, moments = np.flatnonzero(single), select(mass, single)
         parts = _Parts(np.flatnonzero(~single), mass.means[~single], *np.repeat(
             bounds_m[:, None], np.count_nonzero(~single), axis=1))
-        for left in reversed(range(_LIMITS.halvings + 1) if len(parts.owners) else ()):
+        for left in reversed(range(_HALVINGS + 1) if len(parts.owners) else ()):
             samples = parts.sampled(found.select(parts.owners), factors)
             inside = _moments(samples.positions, samples.logs).weighted(
                 parts.log_shares(bounds_m))
             best = max(inside.log_weights.max(), moments.log_weights.max(initial=-np.inf))
-            heavy = inside.log_weights >= best - _LIMITS.margin
+            heavy = inside.log_weights >= best - _MARGIN
             beyond = parts.beyond(samples, heavy)
             poor = np.isfinite(beyond[:, 0]) | heavy & (
-                _effective(samples.logs) < _LIMITS.effective)
+                _effective(samples.logs) < _EFFECTIVE)
             order = np.argsort(-np.where(poor, inside.log_weights, -np.inf), kind='stable')
-            halved = order[:min(np.count_nonzero(poor), _LIMITS.parts)] if left else order[:0]
+            halved = order[:min(np.count_nonzero(poor), _PARTS)] if left else order[:0]
             kept = np.delete(np.arange(len(poor)), halved)
             owners = np.append(owners, parts.owners[kept])
             moments = concatenate(moments, select(inside, kept))
@@ -377,7 +370,7 @@ class _Products(NamedTuple):
     def mixture(self, factors: Sequence[_Factor]) -> Mixture:
         """Return the normalised density, with the covariance that errors of poses cause."""
         constant = self.constant(factors)
-        mixture = self.moments.widened(-constant).reduce(_LIMITS.components).normalised()
+        mixture = self.moments.widened(-constant).reduce(_COMPONENTS).normalised()
         return mixture.shared(np.tensordot(self.moments.probabilities, constant, axes=1))
 
     def constant(self, factors: Sequence[_Factor]) -> np.ndarray:
@@ -394,7 +387,7 @@ class _Products(NamedTuple):
         # Where a product is no Gaussian, its covariance may exceed the inverse of the information.
         roots = np.linalg.cholesky(covariances)
         shares, axes = np.linalg.eigh(np.swapaxes(roots, 1, 2) @ pulls @ roots)
-        moves = roots @ axes * np.sqrt(np.clip(shares, 0.0, _LIMITS.constant))[:, None]
+        moves = roots @ axes * np.sqrt(np.clip(shares, 0.0, _CONSTANT))[:, None]
         return moves @ np.swapaxes(moves, 1, 2)
 
 
@@ -424,7 +417,7 @@ class _Parts(NamedTuple):
 
     def sampled(self, products: _Products, factors: Sequence[_Factor]) -> _Samples:
         """Draw samples of products in the boxes."""
-        n = int(np.clip(_LIMITS.samples // len(self.owners), *_LIMITS.of_product))
+        n = int(np.clip(_SAMPLES // len(self.owners), *_OF_PRODUCT))
         normal = standard_normal(1 << (n.bit_length() - 1))
         positions = np.empty((len(self.owners), *normal.shape))
         logs, groups = np.empty(positions.shape[:2]), []
@@ -494,7 +487,7 @@ def _has_mass(mixture: Mixture) -> np.ndarray:
 
 def _moments(positions: np.ndarray, logs: np.ndarray) -> Mixture:
     """Return the averages, and the moments, of samples [T, S, 3] [m] with log-weights [T, S]."""
-    weights, log_totals = mixture_weights(np.maximum(logs, _LIMITS.never))
+    weights, log_totals = mixture_weights(np.maximum(logs, _NEVER))
     means, covariances = moments(weights, positions)
     log_totals[np.isneginf(logs).all(axis=1)] = -np.inf
     return Mixture._make((log_totals - np.log(logs.shape[1]), means, regular(covariances)))

@@ -40,34 +40,27 @@ class Draw(NamedTuple):
     # Computes the posterior of one shot of a query, or returns None if a search is better.
     fit: Callable[[Query, int], Fit | None]
 
-
-class _Limits(NamedTuple):
-    """Numbers that trade the speed of the search for the completeness of its result."""
-
-    # Number of amplitudes in a block, one for each shot, cell and band, which limits the number
-    # of shots in it.
-    block: int = 1 << 18
-    # Number of cells of a shot that are examined first, to find how likely the others must be.
-    first_cells: int = 48
-    # Number of other relevant cells above which positions are drawn, without a search for modes.
-    searched_cells: int = 100
-    # Largest number of peaks of a shot that are kept, to limit memory and time. Only signals below
-    # the noise have more, and the peaks left out have little weight.
-    peaks: int = 8192
-    # Remaining error of the log-likelihood after a step with the slopes, as a share of the loss
-    # that the step recovers.
-    step_error: float = 0.25
-    # Gain of log-likelihood that a peak may have off a region without extent along an axis.
-    off_region: float = 3.0
-    # Squared Mahalanobis distance below which points belong to the same mode, and largest distance
-    # at which they are compared, in radii of an ellipsoid that contains no other mode.
-    same_mode: float = 2.0
-    reach: float = 3.0
-    # Number of points up to which comparing all pairs is faster than a search tree.
-    few_points: int = 48
-
-
-_LIMITS = _Limits()
+# Number of amplitudes in a block, one for each shot, cell and band, which limits the number of
+# shots in it.
+_BLOCK = 1 << 18
+# Number of cells of a shot that are examined first, to find how likely the others must be.
+_FIRST_CELLS = 48
+# Number of other relevant cells above which positions are drawn, without a search for modes.
+_SEARCHED_CELLS = 100
+# Largest number of peaks of a shot that are kept, to limit memory and time. Only signals below the
+# noise have more, and the peaks left out have little weight.
+_PEAKS = 8192
+# Remaining error of the log-likelihood after a step with the slopes, as a share of the loss that
+# the step recovers.
+_STEP_ERROR = 0.25
+# Gain of log-likelihood that a peak may have off a region without extent along an axis.
+_OFF_REGION = 3.0
+# Squared Mahalanobis distance below which points belong to the same mode, and largest distance at
+# which they are compared, in radii of an ellipsoid that contains no other mode.
+_SAME_MODE = 2.0
+_REACH = 3.0
+# Number of points up to which comparing all pairs is faster than a search tree.
+_FEW_POINTS = 48
 
 
 class Starts(NamedTuple):
@@ -125,7 +118,7 @@ class TemplateTable:
         `draw` computes its posterior. A shot for which it returns one has no points. These
         posteriors are returned, too, keyed by the shot.
         """
-        n = max(1, _LIMITS.block // (len(self.cells.template_energy) * len(self._wavenumbers)))
+        n = max(1, _BLOCK // (len(self.cells.template_energy) * len(self._wavenumbers)))
         parts, drawn = [], {}
         for first in range(0, len(whitened), n):
             query = self.query(whitened[first:first + n], prior, margin)
@@ -140,7 +133,7 @@ class TemplateTable:
         """Apply the matched filters to whitened signals, complex128 [N, N_B, N_SB F]."""
         thin = np.count_nonzero(np.ptp(self._resolution.bounds_m, axis=0) == 0)
         query = Query(*self.filters.apply(whitened), np.empty(()), prior,
-                      np.atleast_1d(margin + thin * _LIMITS.off_region))
+                      np.atleast_1d(margin + thin * _OFF_REGION))
         return query._replace(bound=self._bound(query))
 
     def _starts(self, query: Query, peaks: Peaks) -> Starts:
@@ -161,7 +154,7 @@ class TemplateTable:
         values += np.einsum('pqa,pa->pq', self.cells.regression[peaks.cell], inside - points)
         order = np.lexsort((-value, peaks.shots))
         of_shot = Segments.of_keys(peaks.shots[order])
-        error = _LIMITS.step_error * self.cells.loss[peaks.cell[order]]
+        error = _STEP_ERROR * self.cells.loss[peaks.cell[order]]
         # The values of a peak and of the best one may both be in error.
         slack = error + of_shot.repeat(of_shot.first(error))
         margin = np.broadcast_to(query.margin, self.cells.loss.shape)[peaks.cell[order]]
@@ -177,7 +170,7 @@ class TemplateTable:
         """
         bound, loss, shots = query.bound, self.cells.loss, np.arange(len(query.bound))[:, None]
         # The cells with the highest bounds determine how likely peaks in the others must be.
-        n_first = min(_LIMITS.first_cells, bound.shape[1])
+        n_first = min(_FIRST_CELLS, bound.shape[1])
         first = np.sort(np.argpartition(bound, -n_first, axis=1)[:, -n_first:], axis=1)
         peaks = self._peaks_in(np.repeat(shots, n_first), first.ravel(), query)
         best = np.full(len(shots), -np.inf)
@@ -188,7 +181,7 @@ class TemplateTable:
         drawn = {}
         if draw:
             (weak,) = (best <= draw.largest).nonzero()
-            many = is_likely[weak].sum(axis=1) > _LIMITS.searched_cells
+            many = is_likely[weak].sum(axis=1) > _SEARCHED_CELLS
             drawn = {shot: fit for shot in weak[many].tolist()
                      if (fit := draw.fit(query, shot)) is not None}
         if drawn:
@@ -200,7 +193,7 @@ class TemplateTable:
         (kept,) = (peaks.value + loss[peaks.cell] >= limit[peaks.shots, peaks.cell]).nonzero()
         kept = kept[np.lexsort((-peaks.value[kept], peaks.shots[kept]))]
         peaks = select(
-            peaks, kept[Segments.of_keys(peaks.shots[kept]).places < _LIMITS.peaks])
+            peaks, kept[Segments.of_keys(peaks.shots[kept]).places < _PEAKS])
         radii = self._resolution.separation(query.prior.is_coarse)
         return select(peaks, separate(peaks.shots, self._points(peaks), radii)), drawn
 
@@ -342,7 +335,7 @@ def heaviest(of_shot: Segments, value: np.ndarray, margin: float | np.ndarray) -
 def _near(shots: np.ndarray, scaled: np.ndarray, reach: float
           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return pairs of points of a shot within `reach`, the first one first, and their squares."""
-    if len(scaled) <= _LIMITS.few_points:
+    if len(scaled) <= _FEW_POINTS:
         first, last = _all_pairs(len(scaled))
     else:
         from scipy.spatial import cKDTree
@@ -376,11 +369,11 @@ def separate(shots: np.ndarray, points: np.ndarray, radii: np.ndarray,
     if len(points) < 2:
         return chosen
     better, worse, squares = _near(
-        shots, points / radii, 1.0 if curvature is None else _LIMITS.reach)
+        shots, points / radii, 1.0 if curvature is None else _REACH)
     if curvature is not None:
         offset, close = points[worse] - points[better], squares < 1
         close |= (2 * likelihood_loss(
-            offset[:, :3], curvature.take(worse, axis=0)) < _LIMITS.same_mode) & (
+            offset[:, :3], curvature.take(worse, axis=0)) < _SAME_MODE) & (
                 np.sum((offset / radii)[:, 3:]**2, axis=1) < 1)
         worse, better = worse[close], better[close]
     previous = chosen if not len(worse) else ~chosen

@@ -26,36 +26,28 @@ from rhs_isac_ros.positioning.segments import Segments
 # Phase error of a template at the edge of the aperture or of the band [rad] at which the next
 # template or range bin takes over. The slopes of the templates correct the error to first order.
 PHASE_ERROR = 0.2
-
-
-class _Limits(NamedTuple):
-    """Limits of the lengths of a grid."""
-
-    # Error of the amplitude of a template at which the next range bin takes over.
-    amplitude_error: float = 0.05
-    # In wavelengths and in radians at the edge of the aperture: longest steps for which the linear
-    # model of the mean holds, and radii of an ellipsoid around a mode that contains no other mode.
-    step: tuple[float, float] = (0.2, 0.5)
-    separation: tuple[float, float] = (0.37, 0.57)
-    # Range component of both, in range bins, if phases of the bands do not constrain the range.
-    coarse_bins: float = 0.75
-    # Phases by which neighbouring hypotheses of a rate differ [rad]: of the range at the ends of
-    # the frames of a band, and of u and v at the edge of the aperture at the ends of the cycle.
-    rate: tuple[float, float] = (1.1, 0.85)
-    # Largest value of `Resolution.direction`. It applies to apertures below one wavelength, where
-    # the gains of elements and of the user also change with the direction.
-    direction: float = 0.4
-    # Largest sine of the angle from boresight on the grid; at 1, derivatives are infinite.
-    sine: float = 0.995
-    # Smallest range relative to the farthest one, because directions lose their meaning at the
-    # surface.
-    nearest: float = 1e-3
-    # Information about the position that is added everywhere, relative to a uniform prior over the
-    # region. It keeps matrices invertible where the signals contain no information.
-    floor: float = 0.01
-
-
-_LIMITS = _Limits()
+# Error of the amplitude of a template at which the next range bin takes over.
+_AMPLITUDE_ERROR = 0.05
+# In wavelengths and in radians at the edge of the aperture: longest steps for which the linear
+# model of the mean holds, and radii of an ellipsoid around a mode that contains no other mode.
+_STEP = 0.2, 0.5
+_SEPARATION = 0.37, 0.57
+# Range component of both, in range bins, if phases of the bands do not constrain the range.
+_COARSE_BINS = 0.75
+# Phases by which neighbouring hypotheses of a rate differ [rad]: of the range at the ends of the
+# frames of a band, and of u and v at the edge of the aperture at the ends of the cycle.
+_RATE = 1.1, 0.85
+# Largest value of `Resolution.direction`. It applies to apertures below one wavelength, where the
+# gains of elements and of the user also change with the direction.
+_DIRECTION = 0.4
+# Largest sine of the angle from boresight on the grid; at 1, derivatives are infinite.
+_SINE = 0.995
+# Smallest range relative to the farthest one, because directions lose their meaning at the
+# surface.
+_NEAREST = 1e-3
+# Information about the position that is added everywhere, relative to a uniform prior over the
+# region. It keeps matrices invertible where the signals contain no information.
+_FLOOR = 0.01
 
 
 class Resolution(NamedTuple):
@@ -82,7 +74,7 @@ class Resolution(NamedTuple):
         # The direction also changes the phases of elements in front of the plane or behind it.
         edge_m = np.abs(elements[:, 1:]).max(axis=0) + np.abs(elements[:, 0]).max()
         bounds = scenario.roi_bounds_m
-        direction = 1 / np.maximum(wavenumber * edge_m, 1 / _LIMITS.direction)
+        direction = 1 / np.maximum(wavenumber * edge_m, 1 / _DIRECTION)
         times_s = frame_times_s(scenario)
         # Even a single frame has a duration.
         band_s = np.ptp(times_s[0]) + scenario.frame_duration_s
@@ -92,26 +84,26 @@ class Resolution(NamedTuple):
             direction=direction,
             curvature_m=max(wavenumber * np.sum(elements**2, axis=1).max() / 2, 1e-9),
             delay_m=SPEED_OF_LIGHT_MPS / (np.pi * scenario.bandwidth_hz),
-            nearest_m=max(nearest_m, _LIMITS.nearest * farthest_m), farthest_m=farthest_m,
+            nearest_m=max(nearest_m, _NEAREST * farthest_m), farthest_m=farthest_m,
             direction_bounds=np.stack([lowest, highest], axis=1), bounds_m=bounds,
             rate_steps=np.append(
-                _LIMITS.rate[0] / (wavenumber * band_s / 2),
-                _LIMITS.rate[1] / (times_s.max() + scenario.frame_duration_s) * direction))
+                _RATE[0] / (wavenumber * band_s / 2),
+                _RATE[1] / (times_s.max() + scenario.frame_duration_s) * direction))
 
     def bin_width_m(self, range_m: float) -> float:
         """Return the width of a range bin, in which delays and amplitudes hardly change [m]."""
-        return min(2 * _LIMITS.amplitude_error * range_m, 2 * PHASE_ERROR * self.delay_m)
+        return min(2 * _AMPLITUDE_ERROR * range_m, 2 * PHASE_ERROR * self.delay_m)
 
     def step_limits(self, is_coarse: bool) -> np.ndarray:
         """Return the longest steps in (r [m], u, v) over which the mean is nearly linear, [3]."""
-        return self._radii(is_coarse, *_LIMITS.step)
+        return self._radii(is_coarse, *_STEP)
 
     def separation(self, is_coarse: bool) -> np.ndarray:
         """Return the radii in (r [m], u, v) of an ellipsoid that contains only one mode, [3]."""
-        return self._radii(is_coarse, *_LIMITS.separation)
+        return self._radii(is_coarse, *_SEPARATION)
 
     def _radii(self, is_coarse: bool, wavelengths: float, radians: float) -> np.ndarray:
-        range_m = (_LIMITS.coarse_bins * self.bin_width_m(self.nearest_m) if is_coarse
+        range_m = (_COARSE_BINS * self.bin_width_m(self.nearest_m) if is_coarse
                    else wavelengths * self.wavelength_m)
         radii = np.empty(3)
         radii[0], radii[1:] = range_m, radians * self.direction
@@ -122,8 +114,8 @@ class Resolution(NamedTuple):
         """Curvature in (r, u, v) that is added to every log-likelihood, [3]."""
         extent = np.array([self.farthest_m - self.nearest_m,
                            *(self.direction_bounds[:, 1] - self.direction_bounds[:, 0])])
-        return 12 * _LIMITS.floor / np.maximum(
-            extent, _LIMITS.nearest * np.array([self.farthest_m, 1.0, 1.0]))**2
+        return 12 * _FLOOR / np.maximum(
+            extent, _NEAREST * np.array([self.farthest_m, 1.0, 1.0]))**2
 
 
 def carrier_wavenumbers(scenario: Scenario) -> np.ndarray:
@@ -220,7 +212,7 @@ def _directions(resolution: Resolution) -> np.ndarray:
              for (first, last), step in zip(resolution.direction_bounds, steps, strict=True)]
     directions = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1).reshape(-1, 2)
     # Directions slightly beyond the rim of the half space are moved onto it.
-    excess = np.maximum(np.hypot(*directions.T) / _LIMITS.sine, 1.0)
+    excess = np.maximum(np.hypot(*directions.T) / _SINE, 1.0)
     return (directions / excess[:, None])[excess < 1 + 2 * steps.max()]
 
 

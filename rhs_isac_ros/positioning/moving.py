@@ -22,21 +22,14 @@ from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.segments import concatenate
 from rhs_isac_ros.positioning.templates import turns_at
 
-
-class _Limits(NamedTuple):
-    """Numbers that trade the speed of the search for the completeness of its result."""
-
-    # Largest radial speed and largest speed across the line of sight, in standard deviations.
-    radial: float = 3.5
-    across: float = 2.0
-    # Number of candidates from each hypothesis of the rates, number of starts of a shot, and
-    # largest deficit of their log-likelihoods.
-    candidates: int = 128
-    starts: int = 80
-    margin: float = 90.0
-
-
-_LIMITS = _Limits()
+# Largest radial speed and largest speed across the line of sight, in standard deviations.
+_RADIAL = 3.5
+_ACROSS = 2.0
+# Number of candidates from each hypothesis of the rates, number of starts of a shot, and largest
+# deficit of their log-likelihoods.
+_CANDIDATES = 128
+_STARTS = 80
+_MARGIN = 90.0
 
 
 class _Shell(NamedTuple):
@@ -79,7 +72,7 @@ class MovingTable(TemplateTable):
         super().__init__(scenario, arrays, grid)
         self._times_s, self._std = frame_times_s(scenario), scenario.user_speed_std_mps
         self._steps = self._resolution.rate_steps
-        n = int(np.ceil(_LIMITS.radial * self._std / self._steps[0]))
+        n = int(np.ceil(_RADIAL * self._std / self._steps[0]))
         self._speeds = np.arange(-n, n + 1) * self._steps[0]
         # Phases that add up the frames of a user with each radial speed, [N_B, F, V].
         self._ramps = np.exp(1j * (self._carriers[:, None] * self._times_s)[..., None]
@@ -96,7 +89,7 @@ class MovingTable(TemplateTable):
         high = float(grid.ranges_m[farthest] + grid.widths_m[farthest] / 2)
         n_ranges = int(np.ceil((high - low) / (2 * PHASE_ERROR * resolution.delay_m)))
         ranges_m = low + (np.arange(n_ranges) + 0.5) * (high - low) / n_ranges
-        counts = np.round(_LIMITS.across * self._std / (low * self._steps[1:])).astype(int)
+        counts = np.round(_ACROSS * self._std / (low * self._steps[1:])).astype(int)
         rates = np.stack(np.meshgrid(*(
             np.arange(-n, n + 1) * step for n, step in zip(counts, self._steps[1:], strict=True)
         ), indexing='ij'), axis=-1).reshape(-1, 2)
@@ -157,10 +150,10 @@ class MovingTable(TemplateTable):
                  for hypothesis in range(len(shell.rates))]
         value, points, rates, gains, outputs = map(np.concatenate, zip(*parts, strict=True))
         order = np.argsort(-value, kind='stable')
-        order = order[value[order] >= value[order[0]] - _LIMITS.margin]
+        order = order[value[order] >= value[order[0]] - _MARGIN]
         radii = np.concatenate([self._resolution.separation(prior.is_coarse), self._steps])
         places = np.hstack([points, rates])[order]
-        order = order[separate(np.zeros(len(order), int), places, radii)][:_LIMITS.starts]
+        order = order[separate(np.zeros(len(order), int), places, radii)][:_STARTS]
         values = prior.start(outputs[order].T, gains[order])
         n_moving = prior.velocity.shape[1]
         velocities = np.matmul(jacobian(points[order]), rates[order, :, None])[..., 0]
@@ -188,7 +181,7 @@ class MovingTable(TemplateTable):
         # Bounds of the log-likelihood, for the best range or gain.
         amplitude = prior.amplitude(outputs)
         bound = (amplitude**2 * inverse - self._penalty).ravel()
-        n = min(_LIMITS.candidates, bound.size)
+        n = min(_CANDIDATES, bound.size)
         chosen = np.argpartition(bound, -n)[-n:]
         _, node, speed = np.unravel_index(chosen, amplitude.shape)
         amplitude, inverse = amplitude.ravel()[chosen], inverse.ravel()[chosen]

@@ -1,7 +1,6 @@
 """Offsets of carrier and timing, estimated from the signals before the position is known."""
 
 import functools
-from typing import NamedTuple
 
 import numpy as np
 
@@ -9,23 +8,16 @@ from rhs_isac_ros.model.arrays import blocks, multiply_rows
 from rhs_isac_ros.model.gaussian import quadratic_form, step_to_maximum
 from rhs_isac_ros.positioning.likelihood import Likelihood
 
-
-class _Search(NamedTuple):
-    """Estimation of parameters from the signals alone, and the margin for its errors."""
-
-    # Grid on which parameters with several maxima are compared.
-    reach: float = 4.0  # In standard deviations.
-    points: tuple[int, ...] = (513, 49, 13, 5)  # Per parameter, for 1, 2, 3 and more parameters.
-    points_per_turn: int = 6  # Of the phase between two measurements, if these are more.
-    block: int = 1 << 20  # Number of complex numbers at a time.
-    refinements: int = 4  # Of the best point.
-    # Errors of the estimates, in standard deviations, whose effect the margin covers, and largest
-    # margin. Nearby users have stronger signals than the average, on which the effect depends.
-    deviation: float = 6.0
-    margin: float = 200.0
-
-
-_SEARCH = _Search()
+# Grid on which parameters with several maxima are compared.
+_REACH = 4.0  # In standard deviations.
+_POINTS = (513, 49, 13, 5)  # Per parameter, for 1, 2, 3 and more parameters.
+_POINTS_PER_TURN = 6  # Of the phase between two measurements, if these are more.
+_BLOCK = 1 << 20  # Number of complex numbers at a time.
+_REFINEMENTS = 4  # Of the best point.
+# Errors of the estimates, in standard deviations, whose effect the margin covers, and largest
+# margin. Nearby users have stronger signals than the average, on which the effect depends.
+_DEVIATION = 6.0
+_MARGIN = 200.0
 # Smallest eigenvalue of a sum of signals, as a share of its trace.
 _MIN_SPREAD = 1e-12
 
@@ -52,7 +44,7 @@ class Alignment:
         precision = (known + np.diag(self._prior.precision))[moves]
         loss = np.trace(np.linalg.solve(
             precision, self._prior.direct_information(spread)[moves])) / 2
-        self.margin = min(_SEARCH.deviation**2 * float(loss), _SEARCH.margin)
+        self.margin = min(_DEVIATION**2 * float(loss), _MARGIN)
 
     def values_of_each(self, received: np.ndarray, starts: np.ndarray | None = None
                        ) -> np.ndarray:
@@ -65,7 +57,7 @@ class Alignment:
         if starts is None:
             starts = self._best_on_grid(received)
         prior, moves, values = self._prior, self._prior.moves_multipath, starts.copy()
-        for _ in range(_SEARCH.refinements):
+        for _ in range(_REFINEMENTS):
             divided = prior.divide(received, values)[:, None]
             white = multiply_rows(self._whitener, np.concatenate(
                 [divided, prior.scaled_patterns[moves] * divided], axis=1))
@@ -88,7 +80,7 @@ class Alignment:
         white = multiply_rows(
             np.moveaxis(self._whitener[:, :, groups], 2, 1), received[:, :, groups])
         products = np.matmul(white.conj(), np.swapaxes(white, 2, 3))
-        parts = blocks(len(candidates), max(_SEARCH.block // products[..., 0].size, 1))
+        parts = blocks(len(candidates), max(_BLOCK // products[..., 0].size, 1))
         cost = np.empty((len(received), len(candidates)))
         for part in parts:
             factors = self._factors(part)
@@ -106,11 +98,11 @@ class Alignment:
         """Parameters on the grid, float64 [C, Q]."""
         prior = self._prior
         (searched,) = np.nonzero(prior.needs_search)
-        n_grid = _SEARCH.points[min(len(searched), len(_SEARCH.points)) - 1]
+        n_grid = _POINTS[min(len(searched), len(_POINTS)) - 1]
         # Beyond half a period, the signals repeat.
-        reach = np.minimum(_SEARCH.reach, prior.half_period[searched])
+        reach = np.minimum(_REACH, prior.half_period[searched])
         turns = reach * np.ptp(prior.scaled_patterns[searched].imag, axis=(1, 2))
-        counts = np.maximum(n_grid, np.ceil(_SEARCH.points_per_turn * turns / np.pi)).astype(int)
+        counts = np.maximum(n_grid, np.ceil(_POINTS_PER_TURN * turns / np.pi)).astype(int)
         lines = [np.linspace(-most, most, n)
                  for most, n in zip(reach, counts.tolist(), strict=True)]
         grid = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1)

@@ -25,31 +25,23 @@ from rhs_isac_ros.positioning.search import Modes, marginal_at
 from rhs_isac_ros.positioning.segments import Segments, select
 from rhs_isac_ros.positioning.sheets import Inside, Sheets
 
-
-class _Sampling(NamedTuple):
-    """Numbers that determine how samples represent broad modes."""
-
-    # Factor by which a proposal is wider than its Gaussian, because the tails of the posterior may
-    # be heavier.
-    spread: float = 1.3
-    # Samples with a log-weight below the best by more than this have no effect, whatever their
-    # phases.
-    margin: float = 20.0
-    # Averages over the phases of the bands: spacing of the ranges, in standard deviations of the
-    # product of the bands' factors; and number of values of a phase that all bands share, few
-    # because the average over the range nearly removes the effect of this phase.
-    spacing: float = 1.5
-    common: int = 8
-    # Powers that flatten weights: ratio of successive ones, and largest number of them.
-    flatter: float = 0.8
-    powers: int = 40
-    # Largest standard deviation of a wrapped phase: it is nearly uniform, and one wrap suffices.
-    # Smallest one: with phases that are known better, few samples would carry the weight.
-    phase_std_rad: float = 3.0
-    least_std_rad: float = 0.05
-
-
-_SAMPLING = _Sampling()
+# Factor by which a proposal is wider than its Gaussian, because the tails of the posterior may be
+# heavier.
+_SPREAD = 1.3
+# Samples with a log-weight below the best by more than this have no effect, whatever their phases.
+_MARGIN = 20.0
+# Averages over the phases of the bands: spacing of the ranges, in standard deviations of the
+# product of the bands' factors; and number of values of a phase that all bands share, few because
+# the average over the range nearly removes the effect of this phase.
+_SPACING = 1.5
+_COMMON = 8
+# Powers that flatten weights: ratio of successive ones, and largest number of them.
+_FLATTER = 0.8
+_POWERS = 40
+# Largest standard deviation of a wrapped phase: it is nearly uniform, and one wrap suffices.
+# Smallest one: with phases that are known better, few samples would carry the weight.
+_PHASE_STD_RAD = 3.0
+_LEAST_STD_RAD = 0.05
 
 
 class Samples(NamedTuple):
@@ -80,14 +72,14 @@ class Samples(NamedTuple):
         relative = log_weights - of_shot.repeat(highest)[:, None]
         totals = of_shot.sum(np.exp(relative).sum(axis=1))
         powers = np.ones(len(totals))
-        for _ in range(_SAMPLING.powers):
+        for _ in range(_POWERS):
             weights = np.exp(relative * of_shot.repeat(powers)[:, None])
             weights /= of_shot.repeat(of_shot.sum(weights.sum(axis=1)))[:, None]
             n = 1 / of_shot.sum(np.einsum('ms,ms->m', weights, weights))
             scarce = n < 2 * n_fitted
             if not scarce.any():
                 break
-            powers[scarce] *= _SAMPLING.flatter
+            powers[scarce] *= _FLATTER
         n = np.maximum(n, n_fitted + 1)
         return cls(positions, weights, of_shot,
                    highest + np.log(totals) - np.log(log_weights.shape[1]),
@@ -151,7 +143,7 @@ def draw_broad_samples(
     their weights, [M, S].
     """
     prior, bounds = likelihood.nuisance, likelihood.resolution.bounds_m
-    n_moving, widening = prior.velocity.shape[1], _SAMPLING.spread**2
+    n_moving, widening = prior.velocity.shape[1], _SPREAD**2
     positions, log_weights = Inside.of(
         modes.points, modes.gradient / widening, modes.curvature / widening, bounds
     ).sample(normal)
@@ -185,7 +177,7 @@ def draw_broad_samples(
         evidence += log_share(points.reshape(len(rows), -1, 3), of_state, likelihood.rates(
             of_state.values, of_state.points)).ravel()
         if phases.is_informative:
-            likely = evidence >= evidence.max() - _SAMPLING.margin
+            likely = evidence >= evidence.max() - _MARGIN
             outputs = likelihood.at(
                 points[likely], values[likely], moves=False, turns=False
             ).outputs(values[likely], signals)
@@ -213,7 +205,7 @@ def log_share(points: np.ndarray, modes: Modes, rates: np.ndarray) -> np.ndarray
     squares = (np.einsum('pa,pb->pab', offsets, offsets).reshape(-1, 9)
                @ modes.curvature.reshape(-1, 9).T)
     squares += np.einsum('ma,ma->m', means, spread) - 2 * offsets @ spread.T
-    exponent = -squares / (2 * _SAMPLING.spread**2) + np.linalg.slogdet(modes.curvature)[1] / 2
+    exponent = -squares / (2 * _SPREAD**2) + np.linalg.slogdet(modes.curvature)[1] / 2
     is_apart = np.sum((rates[:, None] - rates)**2, axis=2) >= 1
     exponent = np.where(
         is_apart[:, None], -np.inf, exponent.reshape(n_modes, n_samples, n_modes))
@@ -233,14 +225,14 @@ class BandPhases:
 
     def __init__(self, likelihood: Likelihood) -> None:
         prior = likelihood.nuisance
-        self._std = max(prior.relative_phase_std_rad, _SAMPLING.least_std_rad)
+        self._std = max(prior.relative_phase_std_rad, _LEAST_STD_RAD)
         # Whether there is information that the search ignores; if not, there are no factors.
         self.is_informative = prior.is_coarse and self._std <= UNIFORM_STD_RAD
         if not self.is_informative:
             return
         wavenumbers = carrier_wavenumbers(likelihood.scenario)
         shared = max(prior.phase_covariance.min(), 0.0) if len(wavenumbers) > 1 else 0.0
-        spacing = _SAMPLING.spacing * self._std / np.sqrt(len(wavenumbers))
+        spacing = _SPACING * self._std / np.sqrt(len(wavenumbers))
         n_ranges = int(np.ceil(2 * np.pi / spacing))
         self.offsets_m = (((np.arange(n_ranges) + 0.5) / n_ranges - 0.5)
                           * 2 * np.pi / wavenumbers.mean())
@@ -277,7 +269,7 @@ class BandPhases:
 
         concentration = 2 * np.maximum(magnitude, 1e-9)
         variance = self._std**2 - 2 * np.log(i1e(concentration) / i0e(concentration))
-        return np.minimum(np.sqrt(variance), _SAMPLING.phase_std_rad)
+        return np.minimum(np.sqrt(variance), _PHASE_STD_RAD)
 
 
 def _common_phase(std: float) -> tuple[np.ndarray, np.ndarray]:
@@ -285,9 +277,9 @@ def _common_phase(std: float) -> tuple[np.ndarray, np.ndarray]:
     if std == 0:
         return np.zeros(1), np.zeros(1)
     if std > UNIFORM_STD_RAD:
-        turns = 2 * np.pi * np.arange(_SAMPLING.common) / _SAMPLING.common
-        return turns, np.full(_SAMPLING.common, -np.log(_SAMPLING.common))
-    values, weights = np.polynomial.hermite_e.hermegauss(_SAMPLING.common)
+        turns = 2 * np.pi * np.arange(_COMMON) / _COMMON
+        return turns, np.full(_COMMON, -np.log(_COMMON))
+    values, weights = np.polynomial.hermite_e.hermegauss(_COMMON)
     return std * values, np.log(weights / weights.sum())
 
 

@@ -42,38 +42,30 @@ WRONG = 0.1
 ELSEWHERE = 1e-12
 # Smallest extent of the region of which modes are part without a prior [m].
 MIN_EXTENT_M = 1.0
-
-
-class _Limits(NamedTuple):
-    """Numbers that trade the speed of an update for its accuracy; weights are logarithms."""
-
-    # Reach of a component in the search, in standard deviations of each coordinate. Components
-    # whose squared Mahalanobis distance is below a limit are searched together.
-    reach: float = 4.0
-    boxes: int = 12
-    same_box: float = 9.0
-    # Maximum number of products of a component and a mode, and of those at which the likelihood is
-    # evaluated.
-    products: int = 160
-    exact: int = 16
-    # Components with a smaller weight, or with a smaller density in the region relative to their
-    # largest one, do not contribute to moments.
-    weight: float = -9.0
-    density: float = 0.01
-    # Maximum number of components of a posterior of mixtures, each of which meets all of a phase.
-    components: int = 24
-    # Share of true priors that are doubted.
-    doubt: float = 0.02
-    # Shares of variances that errors of elements cause: number of positions over which they are
-    # averaged, and the largest share.
-    nodes: int = 32
-    most: float = 0.98
-
-
-_LIMITS = _Limits()
+# Reach of a component in the search, in standard deviations of each coordinate. Components whose
+# squared Mahalanobis distance is below a limit are searched together.
+_REACH = 4.0
+_BOXES = 12
+_SAME_BOX = 9.0
+# Maximum number of products of a component and a mode, and of those at which the likelihood is
+# evaluated.
+_PRODUCTS = 160
+_EXACT = 16
+# Components with a smaller log-weight, or with a smaller density in the region relative to their
+# largest one, do not contribute to moments.
+_WEIGHT = -9.0
+_DENSITY = 0.01
+# Maximum number of components of a posterior of mixtures, each of which meets all of a phase.
+_COMPONENTS = 24
+# Share of true priors that are doubted.
+_DOUBT = 0.02
+# Shares of variances that errors of elements cause: number of positions over which they are
+# averaged, and the largest share.
+_NODES = 32
+_MOST = 0.98
 # Negative logarithm of the density at the end of a component's reach, by which modes there may be
 # less likely than others.
-PRIOR_MARGIN = _LIMITS.reach**2 / 2
+PRIOR_MARGIN = _REACH**2 / 2
 # Log-likelihood of a mode that the search has missed, relative to the best mode. The search finds
 # all modes above this value.
 _FLOOR = -(EXACT_MARGIN + PRIOR_MARGIN)
@@ -83,8 +75,8 @@ def cells_of(bent: Sheets, grid: Grid, resolution: Resolution) -> np.ndarray:
     """Mark the cells in which a prior in (r [m], u, v) requires a search, bool [C]."""
     if not len(bent.means):  # All of the prior is behind the surface.
         return np.zeros(len(grid.node), bool)
-    merged = bent.position().reduce(_LIMITS.boxes, _LIMITS.same_box)
-    reach = _LIMITS.reach * np.sqrt(np.diagonal(merged.covariances, axis1=1, axis2=2))[:, None]
+    merged = bent.position().reduce(_BOXES, _SAME_BOX)
+    reach = _REACH * np.sqrt(np.diagonal(merged.covariances, axis1=1, axis2=2))[:, None]
     offsets_m = np.abs(grid.ranges_m - merged.means[:, :1])
     in_range = offsets_m <= reach[..., 0] + grid.widths_m / 2
     offsets = np.abs(grid.nodes[:, 1:] - merged.means[:, None, 1:])
@@ -125,7 +117,7 @@ class Users(NamedTuple):
         prior = prior.or_within(self.centre_m, self.squares_m2, wrong)
         seen = prior.product(likelihood.powered(share)).weighted(np.log1p(-missing))
         unseen = prior.weighted(np.log(missing) - self.log_volume)
-        return concatenate(seen, unseen).normalised().reduce(_LIMITS.components)
+        return concatenate(seen, unseen).normalised().reduce(_COMPONENTS)
 
 
 class Products(NamedTuple):
@@ -155,11 +147,11 @@ def multiply(bent: Sheets, modes: Modes, share: float, conditionals: Sequence[Co
     """
     whole = modes.sheets(share)
     sheets = whole.narrowed(constant, n_before)
-    component, mode = bent.heaviest_pairs(sheets, _LIMITS.products)
+    component, mode = bent.heaviest_pairs(sheets, _PRODUCTS)
     chosen = select(bent, component)
     found = chosen.updated(select(sheets, mode))
     # The heaviest products come first.
-    n = _LIMITS.exact
+    n = _EXACT
     exact = select(chosen, slice(n)).updated(
         _expanded(found.means[:n, :3], select(modes, mode[:n]), share, conditionals, likelihood,
                   signals).narrowed(constant, n_before))
@@ -201,7 +193,7 @@ def is_doubtful(energy: float, n: int) -> bool:
     """Return whether an energy of `Products`, of n numbers, is unusual for a true prior."""
     from scipy.special import gammainccinv
 
-    return energy > float(gammainccinv(n, _LIMITS.doubt))
+    return energy > float(gammainccinv(n, _DOUBT))
 
 
 def uniform(sheets: Sheets, bounds_m: np.ndarray) -> Sheets:
@@ -224,11 +216,11 @@ def inside(density: Sheets, bounds_m: np.ndarray, normal: np.ndarray, pose: Pose
     those inside, normalised, in the frame of the site. `normal`, float64 [S, 3], contains points
     that represent a standard Gaussian.
     """
-    heavy = density.log_weights >= density.log_mass + _LIMITS.weight
+    heavy = density.log_weights >= density.log_mass + _WEIGHT
     density, light = select(density, heavy), select(density, ~heavy)
     gaussians = density.inside(bounds_m)
     peaks = gaussians.logarithm(gaussians.nearest()[:, None])[:, 0]
-    reaches = peaks - density.position().log_peaks >= np.log(_LIMITS.density)
+    reaches = peaks - density.position().log_peaks >= np.log(_DENSITY)
     chosen = reaches if reaches.any() else np.ones(len(reaches), bool)
     density, gaussians = select(density, chosen), gaussians.rows(chosen)
     positions, log_ratio = gaussians.sample(normal)
@@ -254,7 +246,7 @@ def constant_shares(model: MeasurementModel) -> np.ndarray:
     if model.elements.is_exact:
         return np.zeros(3)
     scenario, (low, high) = model.scenario, model.scenario.roi_bounds_m
-    positions = low + streams.unit_points()[:_LIMITS.nodes] * (high - low)
+    positions = low + streams.unit_points()[:_NODES] * (high - low)
     by_point = jacobian(to_polar(positions))
     mean, slopes = model.mean_and_jacobian(positions, by_point)
     nuisance = nuisance_of(scenario)
@@ -272,7 +264,7 @@ def constant_shares(model: MeasurementModel) -> np.ndarray:
     variances = np.linalg.inv(information)
     constant = variances @ pulls @ variances
     shares = np.diagonal(constant, axis1=1, axis2=2) / np.diagonal(variances, axis1=1, axis2=2)
-    return np.minimum(shares[:, :3].mean(axis=0), _LIMITS.most)
+    return np.minimum(shares[:, :3].mean(axis=0), _MOST)
 
 
 def constant_covariance(sheet: Sheets, shares: np.ndarray, pose: Pose) -> np.ndarray:

@@ -21,36 +21,29 @@ from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.sheets import Inside, log_values
 from rhs_isac_ros.positioning.templates import standard_normal
 
-
-class _Limits(NamedTuple):
-    """Numbers that trade the width of Gaussians for the share of effective samples."""
-
-    # Factor by which samples are wider than a Gaussian.
-    spread: float = 1.2
-    # Smallest extent of the region along an axis, relative to the largest one.
-    extent: float = 1e-3
-    # Step of second differences in standard deviations of a Gaussian, and factor by which sheets
-    # are thicker, as they bend more in the tails.
-    step: float = 1.5
-    tails: float = 3.0
-    # Greatest number of Gaussians, over each of which sheets bend anew, and largest increase of
-    # the information after which there is no further one.
-    passes: int = 5
-    settled: float = 1.5
-    # Sheets may meet again if one slopes over the standard deviations of another by less than this
-    # many times what they bend.
-    reach: float = 6.0
-    # Number of ascents from the first sheet, which is wider by a factor, and their steps.
-    starts: int = 16
-    wider: float = 1.7
-    steps: int = 4
-    # Logarithms: smallest excess of a weight over those of all samples, and largest decrease of
-    # the product, at a place that samples miss.
-    excess: float = 1.0
-    decrease: float = 8.0
-
-
-_LIMITS = _Limits()
+# Factor by which samples are wider than a Gaussian.
+_SPREAD = 1.2
+# Smallest extent of the region along an axis, relative to the largest one.
+_EXTENT = 1e-3
+# Step of second differences in standard deviations of a Gaussian, and factor by which sheets are
+# thicker, as they bend more in the tails.
+_STEP = 1.5
+_TAILS = 3.0
+# Greatest number of Gaussians, over each of which sheets bend anew, and largest increase of the
+# information after which there is no further one.
+_PASSES = 5
+_SETTLED = 1.5
+# Sheets may meet again if one slopes over the standard deviations of another by less than this
+# many times what they bend.
+_REACH = 6.0
+# Number of ascents from the first sheet, which is wider by a factor, and their steps.
+_STARTS = 16
+_WIDER = 1.7
+_STEPS = 4
+# Logarithms: smallest excess of a weight over those of all samples, and largest decrease of the
+# product, at a place that samples miss.
+_EXCESS = 1.0
+_DECREASE = 8.0
 
 
 class Rows(NamedTuple):
@@ -94,7 +87,7 @@ def logarithm(terms: Sequence[Term], positions: np.ndarray) -> np.ndarray:
 def prior_information(bounds_m: np.ndarray) -> np.ndarray:
     """Return the information of uniform priors in boxes [2, ..., 3] [m], [..., 3, 3] [1/m^2]."""
     size = np.ptp(bounds_m, axis=0)
-    smallest = _LIMITS.extent * size.max(axis=-1, keepdims=True)
+    smallest = _EXTENT * size.max(axis=-1, keepdims=True)
     return 12 / np.maximum(size, smallest)[..., None]**2 * np.eye(3)
 
 
@@ -131,11 +124,11 @@ def proposal(terms: Sequence[Term], positions: np.ndarray, bounds_m: np.ndarray)
     by_site = by_point.swapaxes(1, 2) @ prior
     total = symmetric(first.curvature + by_site @ by_point)
     step = step_to_maximum(total, (by_site @ (centre - positions)[..., None])[..., 0])
-    for _ in range(_LIMITS.passes):
+    for _ in range(_PASSES):
         positions = np.clip(pose.to_site(to_positions(points + step)), *bounds_m)
         points = to_polar(pose.to_surface(positions))
         by_point = pose.rotation @ jacobian(points)
-        axes = _LIMITS.step * np.linalg.cholesky(np.linalg.inv(total)).swapaxes(1, 2)
+        axes = _STEP * np.linalg.cholesky(np.linalg.inv(total)).swapaxes(1, 2)
         around = pose.to_site(to_positions(
             points[:, None] + np.concatenate([axes, -axes], axis=1)))
         curvature = first.curvature
@@ -143,8 +136,8 @@ def proposal(terms: Sequence[Term], positions: np.ndarray, bounds_m: np.ndarray)
         for other, rows in others:
             here = to_polar(other.to_surface(positions))
             change = to_polar(other.to_surface(around)) - here[:, None]
-            second = (change[:, :3] + change[:, 3:]) / _LIMITS.step**2
-            thicker = _LIMITS.tails**2 * (
+            second = (change[:, :3] + change[:, 3:]) / _STEP**2
+            thicker = _TAILS**2 * (
                 np.sum(second**2, axis=1) / 2 + np.sum(second, axis=1)**2 / 4)
             information = rows.is_sheet[:, None, None] * np.linalg.inv(
                 rows.covariances + thicker[:, :, None] * np.eye(3))
@@ -154,10 +147,10 @@ def proposal(terms: Sequence[Term], positions: np.ndarray, bounds_m: np.ndarray)
             gradient = gradient + (by_slope @ (rows.points - here)[..., None])[..., 0]
         before = total.diagonal(axis1=1, axis2=2)
         total = symmetric(curvature + by_point.swapaxes(1, 2) @ prior @ by_point)
-        if np.all(total.diagonal(axis1=1, axis2=2) <= _LIMITS.settled * before):
+        if np.all(total.diagonal(axis1=1, axis2=2) <= _SETTLED * before):
             break
         step = step_to_maximum(total, gradient)
-    wide = 1 / _LIMITS.spread**2
+    wide = 1 / _SPREAD**2
     return Inside.of(points, wide * gradient, wide * symmetric(curvature), bounds_m, pose)
 
 
@@ -175,7 +168,7 @@ def may_meet_again(terms: Sequence[Term], gaussians: Inside, bounds_m: np.ndarra
         range_m = np.linalg.norm(sight, axis=1)
         slope_m = np.linalg.norm((sight[:, None] @ roots)[:, 0], axis=1) / range_m
         bend_m = width_m2 * (1 / points[:, 0] + 1 / range_m)
-        found |= rows.is_sheet & (slope_m < _LIMITS.reach * bend_m)
+        found |= rows.is_sheet & (slope_m < _REACH * bend_m)
     return found
 
 
@@ -188,21 +181,21 @@ def elsewhere(terms: Sequence[Term], gaussians: Inside, log_weights: np.ndarray,
     first sheet.
     """
     pose, rows = terms[0].pose, terms[0].rows
-    near, curvature = gaussians.points, rows.curvature / _LIMITS.wider**2
+    near, curvature = gaussians.points, rows.curvature / _WIDER**2
     gradient = (curvature @ (rows.points - near)[..., None])[..., 0]
     starts, _ = Inside.of(near, gradient, curvature, bounds_m, pose).sample(
-        standard_normal(_LIMITS.starts))
-    each = np.repeat(np.arange(len(starts)), _LIMITS.starts)
+        standard_normal(_STARTS))
+    each = np.repeat(np.arange(len(starts)), _STARTS)
     repeated = [Term(one.pose, select(one.rows, each)) for one in terms]
     boxes = bounds_m[:, each]
     prior, path = prior_information(boxes), [starts.reshape(-1, 3)]
-    for _ in range(_LIMITS.steps):
+    for _ in range(_STEPS):
         points, gradient, total = expanded(repeated, path[-1], prior)
         path.append(np.clip(pose.to_site(to_positions(
             points + step_to_maximum(total, gradient))), *boxes))
     places = np.concatenate([one.reshape(starts.shape) for one in path], axis=1)
     values = logarithm(terms, places)
     excess = values + gaussians.log_ratio(places) - log_weights.max(axis=1, keepdims=True)
-    excess[values < values.max(axis=1, keepdims=True) - _LIMITS.decrease] = -np.inf
+    excess[values < values.max(axis=1, keepdims=True) - _DECREASE] = -np.inf
     chosen = np.arange(len(places)), np.argmax(excess, axis=1)
-    return np.where((excess[chosen] > _LIMITS.excess)[:, None], places[chosen], np.nan)
+    return np.where((excess[chosen] > _EXCESS)[:, None], places[chosen], np.nan)

@@ -35,23 +35,15 @@ from rhs_isac_ros.positioning.sheets import Inside, Sheets
 # which is accurate to one Gauss-Newton step, and after exact steps.
 GRID_MARGIN = 8.0
 EXACT_MARGIN = 7.0
-
-
-class _Ascent(NamedTuple):
-    """When the steps to a mode end."""
-
-    # Maximum number of exact steps. Few modes need more than two, unless signals are strong. At
-    # the border of the region, small gains may alternate.
-    steps: int = 8
-    # Number of steps to modes from which a refinement starts, which then takes steps of its own.
-    coarse: int = 3
-    # A mode has converged when its last step changed the log-likelihood by less.
-    gain: float = 0.05
-    # Share of the latest step by which the next one turns back, above which it is shortened.
-    turn: float = 0.5
-
-
-_ASCENT = _Ascent()
+# Maximum number of exact steps. Few modes need more than two, unless signals are strong. At the
+# border of the region, small gains may alternate.
+_STEPS = 8
+# Number of steps to modes from which a refinement starts, which then takes steps of its own.
+_COARSE = 3
+# A mode has converged when its last step changed the log-likelihood by less.
+_GAIN = 0.05
+# Share of the latest step by which the next one turns back, above which it is shortened.
+_TURN = 0.5
 # Log-likelihood per u and v by which modes are ordered that are equal up to rounding, as those of
 # a surface whose halves mirror each other. Otherwise, the processor would choose one.
 _PREFERENCE = 1e-6 * np.array([0.0, 1.0, 0.6])
@@ -193,7 +185,7 @@ def modes_from(starts: Starts, likelihood: Likelihood, signals: Signals, aligned
     """
     starts = starts._replace(values=starts.values + aligned[starts.shots])
     return ascend(likelihood, likelihood, starts, signals,
-                  _ASCENT.steps if is_last else _ASCENT.coarse, EXACT_MARGIN + extra_margin)
+                  _STEPS if is_last else _COARSE, EXACT_MARGIN + extra_margin)
 
 
 def likely_modes(modes: Modes, n: int) -> Modes:
@@ -228,7 +220,7 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
         chosen = _prune(likelihood, modes, gain, margin, changed)
         modes, origins = select(modes, chosen), select(origins, chosen)
         gain, known = gain[chosen], known[chosen]
-        (moving,) = (np.abs(gain) > _ASCENT.gain).nonzero()
+        (moving,) = (np.abs(gain) > _GAIN).nonzero()
         if not len(moving) or number == n_steps - 1:
             break
         changed = modes.shots[moving]
@@ -236,7 +228,7 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
         moved, new_gain = step(here)
         reached = moved.log_likelihood - new_gain
         _shorten(moved, new_gain, here, origins.points[moving], likelihood.resolution.bounds_m)
-        too_long = reached < known[moving] - _ASCENT.gain
+        too_long = reached < known[moving] - _GAIN
         short, long = moving[~too_long], moving[too_long]
         origins.points[short], origins.values[short] = modes.points[short], modes.values[short]
         known[short], gain[short] = reached[~too_long], new_gain[~too_long]
@@ -244,10 +236,10 @@ def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, sig
         if len(long):
             _halve(modes, origins, gain, long)
     # Before convergence, the predicted likelihood may be arbitrarily wrong.
-    (moving,) = np.nonzero((np.abs(gain) > _ASCENT.gain) | (len(likelihood.nuisance) > 0))
+    (moving,) = np.nonzero((np.abs(gain) > _GAIN) | (len(likelihood.nuisance) > 0))
     if len(moving):
         modes.replace(moving, step(select(modes, moving).starts(), moves=False)[0])
-        (worse,) = np.nonzero(modes.log_likelihood < known - _ASCENT.gain)
+        (worse,) = np.nonzero(modes.log_likelihood < known - _GAIN)
         if len(worse):
             modes.replace(worse, step(select(origins, worse), moves=False)[0])
         gain[moving] = 0.0
@@ -262,14 +254,14 @@ def _shorten(moved: Modes, gain: np.ndarray, here: Starts, origins: np.ndarray,
     Expected information may be below the curvature, so that each step turns back. Along the latest
     step, the change of the gradient shows the curvature.
     """
-    (rows,) = np.nonzero(np.abs(gain) > _ASCENT.gain)
+    (rows,) = np.nonzero(np.abs(gain) > _GAIN)
     if not len(rows):
         return
     before, step = (here.points - origins)[rows], (moved.points - here.points)[rows]
     slopes = np.matmul(moved.curvature[rows], before[..., None])[..., 0]
     back = -np.sum(step * slopes, axis=1) / np.maximum(
         np.sum(before * slopes, axis=1), np.finfo(float).tiny)
-    turned = back > _ASCENT.turn
+    turned = back > _TURN
     if turned.any():
         rows, left = rows[turned], 1 - 1 / (1 + np.minimum(back[turned], 1.0))
         points = moved.points[rows] - left[:, None] * step[turned]

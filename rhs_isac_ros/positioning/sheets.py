@@ -22,43 +22,36 @@ from rhs_isac_ros.positioning.mixture import Mixture, log_volume
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.templates import standard_normal
 
-
-class _Limits(NamedTuple):
-    """Numbers that keep the restricted Gaussians accurate."""
-
-    # Information that is added to each axis, relative to a uniform prior over the region, and
-    # smallest extent of an axis in it, relative to the largest one. At the edge of the half space,
-    # directions contain no information about x.
-    floor: float = 1e-3
-    extent: float = 1e-3
-    # Smallest standard deviation of the position that range and directions have, relative to the
-    # extent of the region. If they are known better, rounding exceeds the floor.
-    exact: float = 3e-7
-    # In standard deviations: distance from a Gaussian's centre beyond which samples follow a
-    # Gaussian that is nearer, whose distribution function is then accurate; distance beyond which
-    # limits do not change the samples; and width of an interval in which the density is constant.
-    deviation: float = 6.0
-    distant: float = 5.0
-    constant: float = 1e-4
-    # Share of the whole precision of an axis that counts like that of the range in its order.
-    least: float = 1e-6
-    # Standard deviation across the line of sight, relative to the diagonal of the region, above
-    # which a plane does not approximate the sphere.
-    wide: float = 0.5
-    # Distance in standard deviations between both sides of the last axis on the sphere from which
-    # they are separate, and decrease of the log-likelihood up to which the far side counts.
-    separate: float = 1.0
-    far_side: float = 8.0
-    # Smallest cosine of the angle from boresight in curvatures.
-    cosine: float = 0.05
-    # Densities of samples: smallest standard deviation [m], largest share of a uniform prior in
-    # the information along an axis, and number of samples of a mass.
-    std_m: float = 1e-5
-    share: float = 0.9
-    samples: int = 64
-
-
-_LIMITS = _Limits()
+# Information that is added to each axis, relative to a uniform prior over the region, and smallest
+# extent of an axis in it, relative to the largest one. At the edge of the half space, directions
+# contain no information about x.
+_FLOOR = 1e-3
+_EXTENT = 1e-3
+# Smallest standard deviation of the position that range and directions have, relative to the
+# extent of the region. If they are known better, rounding exceeds the floor.
+_EXACT = 3e-7
+# In standard deviations: distance from a Gaussian's centre beyond which samples follow a Gaussian
+# that is nearer, whose distribution function is then accurate; distance beyond which limits do not
+# change the samples; and width of an interval in which the density is constant.
+_DEVIATION = 6.0
+_DISTANT = 5.0
+_CONSTANT = 1e-4
+# Share of the whole precision of an axis that counts like that of the range in its order.
+_LEAST = 1e-6
+# Standard deviation across the line of sight, relative to the diagonal of the region, above which
+# a plane does not approximate the sphere.
+_WIDE = 0.5
+# Distance in standard deviations between both sides of the last axis on the sphere from which they
+# are separate, and decrease of the log-likelihood up to which the far side counts.
+_SEPARATE = 1.0
+_FAR_SIDE = 8.0
+# Smallest cosine of the angle from boresight in curvatures.
+_COSINE = 0.05
+# Densities of samples: smallest standard deviation [m], largest share of a uniform prior in the
+# information along an axis, and number of samples of a mass.
+_STD_M = 1e-5
+_SHARE = 0.9
+_SAMPLES = 64
 
 # By default, regions are in the frame of the surface.
 _AT_SURFACE = Pose()
@@ -97,22 +90,22 @@ class Sheets(Mixture):
         prior contributes to them is removed.
         """
         size, by_point = np.ptp(bounds, axis=0), jacobian(means)
-        prior = np.where(size > 0, 12 / np.maximum(size, _LIMITS.std_m)**2, 0.0)
+        prior = np.where(size > 0, 12 / np.maximum(size, _STD_M)**2, 0.0)
         derivative = polar_derivative(means)
         # Where the region has no extent, the density contains no information across it.
         spread = np.einsum('cpa,cab,cpb->c', by_point, covariances, by_point)
-        across = np.where(size > 0, 0.0, spread[:, None]) + _LIMITS.std_m**2
+        across = np.where(size > 0, 0.0, spread[:, None]) + _STD_M**2
         smallest = (derivative * across[:, None]) @ np.swapaxes(derivative, 1, 2)
         roots = np.linalg.cholesky(symmetric(covariances) + smallest)
         whitened = by_point @ roots
         shares, axes = np.linalg.eigh(
             np.swapaxes(whitened, 1, 2) @ (prior[:, None] * whitened))
-        wider = 1 / (1 - np.minimum(shares, _LIMITS.share))[:, None]
+        wider = 1 / (1 - np.minimum(shares, _SHARE))[:, None]
         by_axis = roots @ axes
         spread = (wider * by_axis) @ np.swapaxes(by_axis, 1, 2)
         sheets = cls._make((np.zeros(len(means)), means, symmetric(spread)))
         gaussians = sheets.inside(bounds)
-        positions, log_ratio = gaussians.sample(standard_normal(_LIMITS.samples))
+        positions, log_ratio = gaussians.sample(standard_normal(_SAMPLES))
         _, log_mass = mixture_weights(gaussians.logarithm(positions) + log_ratio)
         return sheets.weighted(log_weights - log_mass)
 
@@ -155,7 +148,7 @@ class Sheets(Mixture):
         mixture = Mixture._make(self._converted(
             self, pose.to_site(to_positions(points)), pose.rotation @ jacobian(points)))
         # Of the position, only x = r (1 - u^2 - v^2)^(1/2) is curved in u and v.
-        w = np.sqrt(np.maximum(1 - np.sum(cosines**2, axis=1), _LIMITS.cosine**2))[:, None, None]
+        w = np.sqrt(np.maximum(1 - np.sum(cosines**2, axis=1), _COSINE**2))[:, None, None]
         bending = -points[:, :1, None] * (
             np.eye(2) / w + cosines[:, :, None] * cosines[:, None, :] / w**3)
         shift_m, variance_m2 = _moments_of_square(bending, self.covariances[:, 1:3, 1:3])
@@ -267,12 +260,12 @@ class Inside(NamedTuple):
         known = np.sqrt(curvature.diagonal(axis1=1, axis2=2))
         known[:, 1:] /= points[:, :1]  # In standard deviations per metre.
         diagonal_m = np.sqrt(np.einsum('mp,mp->m', extent, extent))
-        widening = 1 / np.maximum(known * _LIMITS.exact * diagonal_m[:, None], 1.0)
+        widening = 1 / np.maximum(known * _EXACT * diagonal_m[:, None], 1.0)
         gradient = widening * gradient
         curvature = widening[:, :, None] * curvature * widening[:, None]
         precision = np.matmul(np.matmul(transposed, curvature), derivative)
-        smallest = _LIMITS.extent * extent.max(axis=1, keepdims=True)
-        np.einsum('mpp->mp', precision)[:] += 12 * _LIMITS.floor / np.maximum(extent, smallest)**2
+        smallest = _EXTENT * extent.max(axis=1, keepdims=True)
+        np.einsum('mpp->mp', precision)[:] += 12 * _FLOOR / np.maximum(extent, smallest)**2
         centre = positions + step_to_maximum(
             precision, np.matmul(transposed, gradient[..., None])[..., 0])
         known = precision.diagonal(axis1=1, axis2=2)
@@ -280,7 +273,7 @@ class Inside(NamedTuple):
         wide = _is_wide(points, curvature, extent)
         if wide.any():
             # The last axis follows the sphere, even if directions determine another better.
-            by_range = curvature[:, :1, 0] * derivative[:, 0]**2 + _LIMITS.least * known
+            by_range = curvature[:, :1, 0] * derivative[:, 0]**2 + _LEAST * known
             last = np.argmax(untied(extent * np.sqrt(by_range)), axis=1)
             kept = order != last[:, None]
             order[wide] = np.column_stack([order[kept].reshape(-1, 2), last])[wide]
@@ -395,14 +388,14 @@ class Inside(NamedTuple):
         found = (self.low_m[:, 2] < 0) & (self.high_m[:, 2] > 0)
         by_range = self.curvature[:, 0, 0] * last**2
         total = np.maximum(self.precision[:, 2, 2], by_range)
-        found &= 2 * by_range * range_m * np.abs(last) > _LIMITS.separate * np.sqrt(total)
+        found &= 2 * by_range * range_m * np.abs(last) > _SEPARATE * np.sqrt(total)
         rows = np.flatnonzero(found)
         if len(rows):
             far_side = self.pose.vectors_to_site(to_positions(self.points[rows]))
             far_side[np.arange(len(rows)), axis[rows]] *= -1
             likelihood = self.rows(rows).logarithm(
                 (far_side + self.pose.origin)[:, None])[:, 0]
-            found[rows] = likelihood - self.log_values[rows] > -_LIMITS.far_side
+            found[rows] = likelihood - self.log_values[rows] > -_FAR_SIDE
         return found
 
     def _side_limits(self, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -522,7 +515,7 @@ def _is_wide(points: np.ndarray, curvature: np.ndarray, extent: np.ndarray) -> n
     large part of the sphere, which no plane approximates.
     """
     least = np.minimum(curvature[:, 1, 1], curvature[:, 2, 2])
-    limit_m2 = _LIMITS.wide**2 * np.einsum('mp,mp->m', extent, extent)
+    limit_m2 = _WIDE**2 * np.einsum('mp,mp->m', extent, extent)
     wide: np.ndarray = points[:, 0]**2 > limit_m2 * least
     return wide
 
@@ -561,12 +554,12 @@ class _Cut(NamedTuple):
 
         width, sign = high - low, np.where(low + high > 0, -1.0, 1.0)
         left, right = np.where(sign < 0, (-high, -low), (low, high))
-        shift = np.minimum(right + _LIMITS.deviation, 0.0)
+        shift = np.minimum(right + _DEVIATION, 0.0)
         left, right = left - shift, right - shift
         share = ndtr(left)
         between = ndtr(right) - share
         centre = np.exp(-(left + right)**2 / 8) / np.sqrt(2 * np.pi)
-        least = _LIMITS.constant
+        least = _CONSTANT
         return cls(sign, shift, share, between, np.log(np.where(
             width > least, between / np.maximum(width, least), centre)))
 
@@ -586,7 +579,7 @@ def _truncated(normal: np.ndarray, low: np.ndarray, high: np.ndarray
     from scipy.special import ndtr, ndtri
 
     deviations = np.repeat(normal[None], len(low), axis=0)
-    wide = (low.max(axis=1) <= -_LIMITS.distant) & (high.min(axis=1) >= _LIMITS.distant)
+    wide = (low.max(axis=1) <= -_DISTANT) & (high.min(axis=1) >= _DISTANT)
     ratio = normal**2 / 2 - np.log(np.where(wide[:, None], high - low, 1.0)) + np.log(
         2 * np.pi) / 2
     if not wide.all():

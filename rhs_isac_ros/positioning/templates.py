@@ -30,25 +30,17 @@ from rhs_isac_ros.support.threads import map_blocks
 
 # Number of points that represent a standard Gaussian.
 N_NORMAL = 128
-
-
-class _Limits(NamedTuple):
-    """Numbers that determine the accuracy of the tables, and the memory of their computation."""
-
-    # Number of templates computed at a time.
-    block: int = 128
-    # Number of positions in the second moments of the means in a part of the region.
-    part_moments: int = 32
-    # Largest mean energy of a component of the whitened signals. The error of a template is about
-    # `PHASE_ERROR` times its amplitude. With this limit, it does not exceed the noise.
-    energy: float = 1 / PHASE_ERROR**2
-    # Error within a range bin, as a share of the energy of the template.
-    error: float = 0.015
-    # Smallest information about a parameter.
-    least: float = 1e-9
-
-
-_LIMITS = _Limits()
+# Number of templates computed at a time.
+_BLOCK = 128
+# Number of positions in the second moments of the means in a part of the region.
+_PART_MOMENTS = 32
+# Largest mean energy of a component of the whitened signals. The error of a template is about
+# `PHASE_ERROR` times its amplitude. With this limit, it does not exceed the noise.
+_ENERGY = 1 / PHASE_ERROR**2
+# Error within a range bin, as a share of the energy of the template.
+_ERROR = 0.015
+# Smallest information about a parameter.
+_LEAST = 1e-9
 
 
 def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None = None,
@@ -97,20 +89,20 @@ def tabulate(model: MeasurementModel, progress: Callable[[float], None] | None =
     of_node = Segments.of_counts(np.bincount(grid.node, minlength=len(grid.nodes)))
 
     def fill(start: int) -> None:
-        nodes = slice(start, min(start + _LIMITS.block, len(grid.nodes)))
+        nodes = slice(start, min(start + _BLOCK, len(grid.nodes)))
         expansion = Expansion.of(model, grid.nodes[nodes])
         by_frame = expansion.mean.conj().reshape(-1, n_bands, n_subbands, n_frames)
         table['filters'][:, :, nodes] = np.moveaxis(by_frame, 0, 2)
         by_frame = expansion.slopes.conj().reshape(-1, 3, n_bands, n_subbands, n_frames)
         table['slope_filters'][:, :, nodes] = np.moveaxis(by_frame, (0, 1), (2, 3))
         first, n = of_node.starts[start], of_node.counts[nodes].sum()
-        for cells in np.array_split(by_node[first:first + n], -(-n // _LIMITS.block)):
+        for cells in np.array_split(by_node[first:first + n], -(-n // _BLOCK)):
             of_cells = _of_cells(
                 expansion, table['whitener'], grid.node[cells] - start, points[cells], prior)
             for name, values in of_cells.items():
                 table[name][cells] = values
 
-    map_blocks(fill, range(0, len(grid.nodes), _LIMITS.block), progress)
+    map_blocks(fill, range(0, len(grid.nodes), _BLOCK), progress)
     return table
 
 
@@ -124,7 +116,7 @@ def _of_cells(expansion: Expansion, whitener: np.ndarray, index: np.ndarray, poi
     # Products of the means, in the first row and column, and of their derivatives.
     form = quadratic_form(white.reshape(len(points), 4 + len(prior), -1))
     information = form[:, 1:, 1:].copy()
-    information[:, 3:, 3:] += prior.information + np.diag(prior.precision + _LIMITS.least)
+    information[:, 3:, 3:] += prior.information + np.diag(prior.precision + _LEAST)
     marginal = marginalise(information, np.zeros(information.shape[:2]))
     return {
         'template_energy': np.sum(np.abs(template)**2, axis=(1, 2, 3)),
@@ -144,7 +136,7 @@ def _positions_in(scenario: Scenario, part: Grid | None) -> np.ndarray:
         return low + (high - low) * streams.unit_points()
     centres = to_positions(part.points)
     low, high = (np.clip(edge, low, high) for edge in (centres.min(axis=0), centres.max(axis=0)))
-    return low + (high - low) * streams.unit_points()[:_LIMITS.part_moments]
+    return low + (high - low) * streams.unit_points()[:_PART_MOMENTS]
 
 
 def _moments(model: MeasurementModel, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -152,7 +144,7 @@ def _moments(model: MeasurementModel, positions: np.ndarray) -> tuple[np.ndarray
 
     Where sub-bands fade alike, the energy of some components of whitened signals is so large that
     errors of templates in them outweigh all else. The limiter scales such a component to a mean
-    energy of `_LIMITS.energy`. For the limiter, stronger signals are scaled down to the median
+    energy of `_ENERGY`. For the limiter, stronger signals are scaled down to the median
     energy.
     """
     white = np.matmul(
@@ -162,7 +154,7 @@ def _moments(model: MeasurementModel, positions: np.ndarray) -> tuple[np.ndarray
     spread, typical = (np.matmul(np.swapaxes(white * weights[:, None], 1, 2), white.conj())
                        / len(positions) for weights in (np.ones(len(positions)), shares))
     energies, components = np.linalg.eigh(typical)
-    scale = 1 / np.sqrt(np.maximum(energies / _LIMITS.energy, 1.0)) - 1
+    scale = 1 / np.sqrt(np.maximum(energies / _ENERGY, 1.0)) - 1
     limiter = np.eye(spread.shape[1]) + np.matmul(
         components * scale[:, None], adjoint(components))
     return spread, limiter
@@ -245,7 +237,7 @@ class Cells(NamedTuple):
         half = PHASE_ERROR * resolution.direction
         across = np.abs(arrays['curvature'][:, 1:, 1:])
         loss = np.einsum('a,cab,b->c', half, across, half) / 2 + (
-            arrays['error'] + _LIMITS.error * energy)
+            arrays['error'] + _ERROR * energy)
         return cls(
             range_m, arrays['template_energy'], energy, slope, slope[:, 0] + 2 * energy / range_m,
             curvature, np.linalg.inv(curvature).astype(np.float32), arrays['marginal'] + floor,

@@ -8,7 +8,6 @@ it with the signals. Velocities are assumed to drift at random, with sudden turn
 
 import dataclasses
 import itertools
-from typing import NamedTuple
 
 import numpy as np
 
@@ -25,28 +24,19 @@ from rhs_isac_ros.support.threads import one_blas_thread
 
 # A track ends after this time without an update [s].
 MAX_GAP_S = 10.0
-
-
-class Limits(NamedTuple):
-    """Numbers that trade the speed of a track for its accuracy; weights are logarithms."""
-
-    # Bounds of the intervals, as shares of the time between two phases, for which turns are
-    # modelled separately. A single interval would make the position after an early turn too
-    # unlikely, because its Gaussian applies to the mean time of a turn.
-    turn_intervals: tuple[float, ...] = (0.0, 0.5, 1.0)
-    # Components below the heaviest by more than this do not turn.
-    turn_margin: float = 10.0
-    # Rate at which a track is assumed to be wrong [1/s]; the user is then anywhere in the region.
-    loss_rate_hz: float = 1e-3
-    # Phases with a smaller share of new information do not update the track. The share is an
-    # exponent of the likelihood; with a small one, modes overlap, and the likelihood is no longer
-    # their sum.
-    least_share: float = 0.25
-    # Distance over which errors of elements change, so that they favour other modes [m].
-    shared_m: float = 1.0
-
-
-LIMITS = Limits()
+# Bounds of the intervals, as shares of the time between two phases, for which turns are modelled
+# separately. A single interval would make the position after an early turn too unlikely, because
+# its Gaussian applies to the mean time of a turn.
+_TURN_INTERVALS = 0.0, 0.5, 1.0
+# Components whose log-weight is below the largest by more than this do not turn.
+_TURN_MARGIN = 10.0
+# Rate at which a track is assumed to be wrong [1/s]; the user is then anywhere in the region.
+_LOSS_RATE_HZ = 1e-3
+# Phases with a smaller share of new information do not update the track. The share is an exponent
+# of the likelihood; with a small one, modes overlap, and the likelihood is no longer their sum.
+_LEAST_SHARE = 0.25
+# Distance over which errors of elements change, so that they favour other modes [m].
+_SHARED_M = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,18 +73,18 @@ class Motion:
         """Return the mixture after a time of at least 0 [s].
 
         Every component splits into one without a turn and, unless its weight is low, one with a
-        turn in each of the `Limits.turn_intervals`.
+        turn in each of the `_TURN_INTERVALS`.
         """
         log_no_turn = -finite('elapsed_s', elapsed_s, 0.0) / self.turn_s
         turn = -np.expm1(log_no_turn)
         straight = self._straight(mixture, elapsed_s).weighted(log_no_turn)
-        heavy = mixture.log_weights >= mixture.log_weights.max() - LIMITS.turn_margin
+        heavy = mixture.log_weights >= mixture.log_weights.max() - _TURN_MARGIN
         mixture = select(mixture, heavy)
         return concatenate(
             straight,
             *(self._turned(mixture.weighted(np.log(turn * (end - begin))),
                            begin * elapsed_s, end * elapsed_s, elapsed_s)
-              for begin, end in itertools.pairwise(LIMITS.turn_intervals)))
+              for begin, end in itertools.pairwise(_TURN_INTERVALS)))
 
     def _straight(self, mixture: Mixture, elapsed_s: float) -> Mixture:
         memory_s, ratio = self.memory_s, elapsed_s / self.memory_s
@@ -171,10 +161,10 @@ class MixtureTracker:
             return None
         predicted = self._motion.predict(self._mixture, elapsed_s)
         share = independent_share(self._scenario, elapsed_s)
-        if share < LIMITS.least_share:
+        if share < _LEAST_SHARE:
             return self._described(predicted, constant)
         self._mixture = self._users.updated(
-            predicted, likelihood, missing, share, LIMITS.loss_rate_hz * elapsed_s)
+            predicted, likelihood, missing, share, _LOSS_RATE_HZ * elapsed_s)
         self._time_s = time_s
         self._n_phases += 1
         return self._described(self._mixture, constant)
@@ -225,9 +215,9 @@ class Tracker:
         if self._mixture is None or elapsed_s > MAX_GAP_S or time_s <= self._latest_s:
             return self._alone(time_s, received)
         share = independent_share(self.estimator.scenario, elapsed_s)
-        is_new = share >= LIMITS.least_share
+        is_new = share >= _LEAST_SHARE
         # The evidence of phases with the same errors grows more slowly than their number.
-        distance = elapsed_s * self._motion.speed_mps / LIMITS.shared_m
+        distance = elapsed_s * self._motion.speed_mps / _SHARED_M
         n_before = min(self._n_phases, 1 / np.expm1(max(distance, 1e-6)))
         shared = float(self.estimator.constant_shares[0])
         predicted = self._motion.predict(self._mixture._replace(
@@ -251,7 +241,7 @@ class Tracker:
         """Return the posterior for a prediction; see `SearchEstimator.posterior`."""
         share = independent_share(self.estimator.scenario, elapsed_s)
         return self.estimator.posterior(
-            received, predicted, share=share, wrong=LIMITS.loss_rate_hz * elapsed_s,
+            received, predicted, share=share, wrong=_LOSS_RATE_HZ * elapsed_s,
             n_before=n_before)
 
     def predict(self, time_s: float) -> tuple[np.ndarray, np.ndarray] | None:

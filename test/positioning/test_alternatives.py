@@ -69,7 +69,7 @@ def reference(setting):
     direction[:, 0] = np.abs(direction[:, 0])
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     # Half a step beyond both ends, as the cells of the grid.
-    ratio = np.sqrt(alternatives.GRID.range_ratio)
+    ratio = np.sqrt(alternatives._RANGE_RATIO)
     distance = rng.uniform(ranges[0] / ratio, ranges[1] * ratio, n)
     positions = distance[:, None] * direction
     positions = positions[np.linalg.norm(

@@ -242,7 +242,7 @@ def test_users_elsewhere_have_the_evidence_of_the_true_set(
     surface = MeasurementModel(SCENARIO, codebook, with_failures(failed, [0.1, 0.8]))
     received = 10**(level_db / 20) * surface.sample(
         to_positions(point), np.random.default_rng(3))
-    monkeypatch.setattr(alternatives, 'GRID', alternatives.GRID._replace(templates=1000))
+    monkeypatch.setattr(alternatives, '_TEMPLATES', 1000)
     elsewhere = (Blocked(SCENARIO, received.size) if level_db
                  else Outside(SCENARIO, tabulate_outside(likelihood.model)))
     points, values, level = elsewhere.places(
@@ -311,10 +311,10 @@ def test_few_hypotheses_of_each_set_and_of_each_site_are_extended():
     ranked = [((1,), site) for site in range(10)] + [((set_,), 0) for set_ in range(2, 20)]
     chosen = failures._diverse(ranked)
     sets, sites = (collections.Counter(one) for one in zip(*chosen, strict=True))
-    assert max(sets.values()) == failures.LIMITS.per_set
-    assert max(sites.values()) == failures.LIMITS.per_place
-    different = [((number,), number) for number in range(2 * failures.LIMITS.extended)]
-    assert failures._diverse(different) == different[:failures.LIMITS.extended]
+    assert max(sets.values()) == failures._PER_SET
+    assert max(sites.values()) == failures._PER_PLACE
+    different = [((number,), number) for number in range(2 * failures._EXTENDED)]
+    assert failures._diverse(different) == different[:failures._EXTENDED]
 
 
 def test_neighbours_differ_by_one_element(ambiguous):

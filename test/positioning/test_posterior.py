@@ -12,7 +12,7 @@ from rhs_isac_ros.positioning import estimators, make_estimator
 from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.posterior import (
-    _SAMPLING,
+    _SPREAD,
     BandPhases,
     Samples,
     _log_density,
@@ -73,7 +73,7 @@ def test_the_shares_of_overlapping_modes_follow_their_densities():
     modes = Modes(**fields | {
         'points': means - 0.1, 'gradient': gradient, 'curvature': curvature})
     points = rng.normal(5, 1, (n, 5, 3))
-    widening = _SAMPLING.spread**2
+    widening = _SPREAD**2
     density = np.stack([multivariate_normal(mean, widening * np.linalg.inv(one)).pdf(points)
                         for mean, one in zip(means, curvature, strict=True)])
     np.testing.assert_allclose(
