@@ -1,5 +1,6 @@
 """Descriptions of what a result depends on: sources, and values that functions use."""
 
+import ast
 import contextlib
 import functools
 import hashlib
@@ -124,9 +125,31 @@ def _digest(*files: str, text: str) -> str:
 
 
 def code_of(module: types.ModuleType) -> str:
-    """Return a digest of the functions and classes of a module as this process has loaded them."""
+    """Return a digest of a module's functions, classes and constants as this process has them."""
     codes = {f'{name}.{part}': inspect.unwrap(one).__code__ for name, value in vars(module).items()
              if getattr(value, '__module__', '') == module.__name__
              for part, one in (vars(value).items() if isinstance(value, type) else [('', value)])
              if inspect.isfunction(one)}
-    return hashlib.sha256(json.dumps(_definition(codes, set())).encode()).hexdigest()[:16]
+    text = json.dumps(_definition([codes, _constants(module)], set()))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _constants(module: types.ModuleType) -> dict[str, Any]:
+    """Return the present values of names to which a module assigns numbers, texts and the like.
+
+    Those that its functions declare as global may change in each process.
+    """
+    try:
+        tree = ast.parse(inspect.getsource(module))
+    except (OSError, SyntaxError, TypeError):
+        return {}
+    changed = {name for node in ast.walk(tree) if isinstance(node, ast.Global)
+               for name in node.names}
+    names = set()
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value:
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            with contextlib.suppress(TypeError, ValueError):
+                hash(ast.literal_eval(node.value))
+                names |= {target.id for target in targets if isinstance(target, ast.Name)}
+    return {name: getattr(module, name, None) for name in sorted(names - changed)}

@@ -183,12 +183,15 @@ def test_a_plugin_that_an_argument_names_is_a_source(tmp_path, monkeypatch):
     assert found == [{'n': 1}, {'n': 2}]
 
 
-def test_a_worker_with_a_module_from_before_an_edit_is_an_error(tmp_path, monkeypatch):
+@pytest.mark.parametrize('text', [
+    'class Grid:\n    def n(self): return {}\n',
+    'N = n_calls = {}\nM: float = 1.5\nclass Grid:\n    def n(self): return N\n'])
+def test_a_worker_with_a_module_from_before_an_edit_is_an_error(tmp_path, monkeypatch, text):
     monkeypatch.setattr(sys, 'dont_write_bytecode', True)
     monkeypatch.syspath_prepend(tmp_path)
     digests, ends = [], []
-    for text in ('1', '2'):
-        (tmp_path / 'old_lab.py').write_text(f'class Grid:\n    def n(self): return {text}\n')
+    for number in (1, 2):
+        (tmp_path / 'old_lab.py').write_text(text.format(number))
         monkeypatch.delitem(sys.modules, 'old_lab', raising=False)
         importlib.invalidate_caches()
         digests.append(sources.code_of(importlib.import_module('old_lab')))

@@ -1,6 +1,7 @@
 """Sources of results: code and values, from files and without."""
 
 import functools
+import importlib
 import linecache
 import sys
 import types
@@ -8,7 +9,7 @@ import types
 import numpy as np
 import pytest
 
-from rhs_isac_ros.support.sources import sources_of
+from rhs_isac_ros.support.sources import code_of, sources_of
 
 
 def test_a_function_without_a_module_in_a_file_is_a_source():
@@ -69,3 +70,17 @@ def test_values_bound_to_a_function_are_sources():
         one, other, same = (sources_of(wrap(value)) for value in (
             np.arange(2000), np.arange(1, 2001), np.arange(2000)))
         assert one == same != other
+
+
+def test_what_a_module_counts_or_collects_does_not_change_its_code(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, 'dont_write_bytecode', True)
+    (tmp_path / 'counting_lab.py').write_text(
+        'LIMIT = 3\nn_calls = 0\nfound = {}\n'
+        'def work():\n    global n_calls\n    n_calls += 1\n    found[n_calls] = LIMIT\n')
+    module = importlib.import_module('counting_lab')
+    before = code_of(module)
+    module.work()
+    assert module.found == {1: 3} and code_of(module) == before
+    module.LIMIT = 4
+    assert code_of(module) != before
