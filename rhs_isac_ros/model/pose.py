@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -80,6 +80,10 @@ class Pose:
     def rotation(self) -> np.ndarray:
         """The matrix R, float64 [3, 3], read-only."""
         return read_only(rotation_matrix(np.array(self.quaternion)))
+
+    def frames(self, n: int) -> 'Frames':
+        """Return n equal frames."""
+        return Frames(self.origin[None].repeat(n, axis=0), self.rotation[None].repeat(n, axis=0))
 
     @functools.cached_property
     def covariance(self) -> np.ndarray:
@@ -157,6 +161,35 @@ class Pose:
         sine = float(np.linalg.norm(turn[:3]))
         angle = 2 * math.atan2(sine, turn[3])
         return np.append(shift, turn[:3] * (angle / sine if sine else 2.0))
+
+
+class Frames(NamedTuple):
+    """The frames of M surfaces in that of the site, for positions or vectors [M, ..., 3]."""
+
+    origin: np.ndarray  # Float64 [M, 3] [m].
+    rotation: np.ndarray  # From the surface to the site, float64 [M, 3, 3].
+
+    def to_site(self, positions: np.ndarray) -> np.ndarray:
+        """Convert positions [M, 3] [m]; see `Pose.to_site`."""
+        return self.vectors_to_site(positions) + self.origin
+
+    def to_surface(self, positions: np.ndarray) -> np.ndarray:
+        """Convert positions [M, 3] or [M, S, 3] [m]; see `Pose.to_surface`."""
+        origin = self.origin[:, None] if positions.ndim > 2 else self.origin
+        return _turned(positions - origin, self.rotation)
+
+    def vectors_to_site(self, vectors: np.ndarray) -> np.ndarray:
+        """Rotate vectors [M, 3]; see `Pose.vectors_to_site`."""
+        return _turned(vectors, self.rotation.swapaxes(1, 2))
+
+    def frames(self, _: int) -> 'Frames':
+        """Return these frames."""
+        return self
+
+
+def _turned(vectors: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Multiply rows [M, 3] or [M, S, 3] by matrices [M, 3, 3]."""
+    return np.matmul(vectors.reshape(len(vectors), -1, 3), rotations).reshape(vectors.shape)
 
 
 def unit_quaternion(quaternion: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import checked_bounds, log_size, mixture_weights
+from rhs_isac_ros.model.arrays import checked_bounds, log_size, log_sum, mixture_weights
 from rhs_isac_ros.model.gaussian import likelihood_loss, moments, step_to_maximum, symmetric
 from rhs_isac_ros.model.geometry import polar_derivative, to_positions
 from rhs_isac_ros.model.pose import Pose
@@ -43,7 +43,7 @@ from rhs_isac_ros.positioning.products import (
     prior_information,
     proposal,
 )
-from rhs_isac_ros.positioning.segments import concatenate, select
+from rhs_isac_ros.positioning.segments import Segments, concatenate, select
 from rhs_isac_ros.positioning.sheets import Inside, Sheets, move_inside
 from rhs_isac_ros.positioning.templates import standard_normal
 from rhs_isac_ros.support.recent import Recent
@@ -112,7 +112,8 @@ class Fuser:
         bounds_m = checked_bounds(bounds_m)
         self._bounds_m, self._outside_probability = bounds_m, outside_probability
         self._velocity_variance = velocity_variance(user_speed_std_mps, bounds_m)
-        self._factor = Recent(functools.partial(_Factor.of, bounds_m=bounds_m), _KEPT)
+        self._factors = functools.partial(_Factor.of_each, bounds_m=bounds_m)
+        self._factor = Recent(self._factor_of, _KEPT)
         self._product = Recent(self._multiply, _KEPT)
         self._fused = Recent(self._locate, _KEPT)
 
@@ -121,7 +122,12 @@ class Fuser:
         """Multiply likelihoods; see the function `fuse`."""
         if not sightings:
             raise ValueError('sightings: none, expected at least one')
+        self._factor.keep(dict.fromkeys(sightings), self._factors)
         return self._fused(tuple(sightings))
+
+    def _factor_of(self, sighting: Sighting) -> '_Factor':
+        (factor,) = self._factors([sighting])
+        return factor
 
     def _multiply(self, sightings: tuple[Sighting, ...]) -> '_Products':
         if len(sightings) == 1:
@@ -151,19 +157,6 @@ class Fuser:
                 [one.mixture for one in sightings], self._velocity_variance)
 
 
-def _inside(sheets: Sheets, bounds_m: np.ndarray, pose: Pose, near: np.ndarray) -> Mixture:
-    """Return averages and moments of sheets in a box, which contains positions near to them."""
-    gaussians = sheets.inside(bounds_m, pose, near)
-    positions, log_ratio = gaussians.sample(standard_normal(_OF_SHEET))
-    return _moments(positions, gaussians.logarithm(positions) + log_ratio)
-
-
-def _log_average(sheets: Sheets, bounds_m: np.ndarray) -> float:
-    """Return the logarithm of the average of sheets in a box in the frame of their surface."""
-    points = move_inside(sheets.means, np.linalg.inv(sheets.covariances), bounds_m)
-    return _inside(sheets, bounds_m, _AT_SURFACE, to_positions(points)).log_mass
-
-
 def _smallest_box(bounds_m: np.ndarray, pose: Pose) -> np.ndarray:
     """Return the bounds of the smallest box in the frame of a surface that contains a box."""
     corners = pose.to_surface(np.stack(np.meshgrid(*bounds_m.T), axis=-1).reshape(-1, 3))
@@ -183,27 +176,49 @@ class _Factor(NamedTuple):
     thickness: float  # Decreases with the median information about the range.
 
     @classmethod
-    def of(cls, sighting: Sighting, bounds_m: np.ndarray) -> '_Factor':
-        """Widen sheets by the errors of the pose; this does not change their masses."""
-        pose, sheets = sighting.pose, sighting.likelihood
-        points = move_inside(sheets.means, np.linalg.inv(sheets.covariances), bounds_m, pose)
-        best = pose.to_site(to_positions(points))
-        derivative = polar_derivative(points) @ pose.rotation.T
-        sheets = sheets.widened(symmetric(
-            derivative @ pose.spread(best) @ np.swapaxes(derivative, 1, 2)))
-        inside = _inside(sheets, bounds_m, pose, best)
-        kept = np.flatnonzero(_has_mass(inside))
+    def of_each(cls, sightings: Sequence[Sighting], bounds_m: np.ndarray) -> list['_Factor']:
+        """Return the factors of all surfaces.
+
+        Each sheet is restricted to the region of the site, with the errors of the pose, and to
+        that of its surface, without.
+        """
+        of_surface = [_smallest_box(bounds_m, one.pose) if one.region_m is None else one.region_m
+                      for one in sightings]
+        likelihoods = [one.likelihood for one in sightings]
+        of_sighting = Segments.of_counts(np.array([len(one.means) for one in likelihoods]))
+        n = int(of_sighting.counts.sum())
+        boxes = np.concatenate([np.repeat(bounds_m[:, None], n, axis=1), np.stack(
+            of_surface, axis=1).repeat(of_sighting.counts, axis=1)], axis=1)
+        frames = concatenate(*(one.pose.frames(len(sheets.means)) for one, sheets in zip(
+            sightings, likelihoods, strict=True)), _AT_SURFACE.frames(n))
+        sheets = concatenate(*likelihoods, *likelihoods)
+        points = move_inside(sheets.means, np.linalg.inv(sheets.covariances), boxes, frames)
+        near = frames.to_site(to_positions(points))
+        derivative = polar_derivative(points[:n]) @ frames.rotation[:n].swapaxes(1, 2)
+        spread = np.concatenate([one.pose.spread(near[rows]) for one, rows in zip(
+            sightings, of_sighting.slices, strict=True)])
+        # This does not change the masses.
+        sheets.covariances[:n] += symmetric(derivative @ spread @ derivative.swapaxes(1, 2))
+        gaussians = sheets.inside(boxes, frames, near)
+        positions, log_ratio = gaussians.sample(standard_normal(_OF_SHEET))
+        inside, _ = _moments(positions, gaussians.logarithm(positions) + log_ratio)
+        return [cls._of(
+            one, region_m, bounds_m, points[rows], select(sheets, rows), select(inside, rows),
+            log_sum(inside.log_weights[n:][rows])) for one, region_m, rows in zip(
+                sightings, of_surface, of_sighting.slices, strict=True)]
+
+    @classmethod
+    def _of(cls, sighting: Sighting, region_m: np.ndarray, bounds_m: np.ndarray,
+            points: np.ndarray, sheets: Sheets, inside: Mixture, log_mass: float) -> '_Factor':
+        """Take sheets inside the region, and the mass in the region of the surface."""
+        pose, kept = sighting.pose, np.flatnonzero(_has_mass(inside))
         sheets, inside = select(sheets, kept), select(inside, kept)
         curvature = np.linalg.inv(sheets.covariances)
         heights = -likelihood_loss(points[kept] - sheets.means, curvature)
         centre, size = bounds_m.mean(axis=0), np.ptp(bounds_m, axis=0)
-        region_m = sighting.region_m
-        if region_m is None:
-            region_m = _smallest_box(bounds_m, pose)
         # Without sheets, the region of the surface is not known. If a maximum is in that of the
         # site, it is taken to be the same.
-        log_average = inside.log_mass - _log_average(
-            sighting.sheets, region_m) if sighting.sheets else float(heights.max())
+        log_average = (inside.log_mass - log_mass) if sighting.sheets else float(heights.max())
         is_far = heights.max() < _FAR
         if is_far:
             log_average = min(log_average, _TAIL)
@@ -347,13 +362,12 @@ class _Products(NamedTuple):
             bounds_m[:, None], np.count_nonzero(~single), axis=1))
         for left in reversed(range(_HALVINGS + 1) if len(parts.owners) else ()):
             samples = parts.sampled(found.select(parts.owners), factors)
-            inside = _moments(samples.positions, samples.logs).weighted(
-                parts.log_shares(bounds_m))
+            inside, effective = _moments(samples.positions, samples.logs)
+            inside = inside.weighted(parts.log_shares(bounds_m))
             best = max(inside.log_weights.max(), moments.log_weights.max(initial=-np.inf))
             heavy = inside.log_weights >= best - _MARGIN
             beyond = parts.beyond(samples, heavy)
-            poor = np.isfinite(beyond[:, 0]) | heavy & (
-                _effective(samples.logs) < _EFFECTIVE)
+            poor = np.isfinite(beyond[:, 0]) | heavy & (effective < _EFFECTIVE)
             order = np.argsort(-np.where(poor, inside.log_weights, -np.inf), kind='stable')
             halved = order[:min(np.count_nonzero(poor), _PARTS)] if left else order[:0]
             kept = np.delete(np.arange(len(poor)), halved)
@@ -437,7 +451,7 @@ class _Parts(NamedTuple):
             if len(rows):
                 found[mine[rows]] = elsewhere(
                     [Term(one.pose, select(one.rows, rows)) for one in terms],
-                    gaussians.rows(rows), samples.logs[mine[rows]], self._boxes(mine[rows]))
+                    select(gaussians, rows), samples.logs[mine[rows]], self._boxes(mine[rows]))
         return found
 
     def _boxes(self, chosen: np.ndarray) -> np.ndarray:
@@ -468,15 +482,6 @@ def _terms(factors: Sequence[_Factor], rows: np.ndarray) -> list[Term]:
     return [one.term(chosen) for one, chosen in zip(factors, rows.T, strict=True)]
 
 
-def _effective(logs: np.ndarray) -> np.ndarray:
-    """Return the effective share of samples with log-weights [..., S], from 0 to 1, [...]."""
-    highest = logs.max(axis=-1, keepdims=True)
-    weights = np.exp(logs - np.where(np.isfinite(highest), highest, 0.0))
-    squares = np.sum(weights**2, axis=-1)
-    share: np.ndarray = np.sum(weights, axis=-1)**2 / np.maximum(squares, 1e-300)
-    return share / logs.shape[-1]
-
-
 def _has_mass(mixture: Mixture) -> np.ndarray:
     """Mark components with a mass; raise ValueError if there is none."""
     chosen: np.ndarray = np.isfinite(mixture.log_weights)
@@ -485,9 +490,13 @@ def _has_mass(mixture: Mixture) -> np.ndarray:
     return chosen
 
 
-def _moments(positions: np.ndarray, logs: np.ndarray) -> Mixture:
-    """Return the averages, and the moments, of samples [T, S, 3] [m] with log-weights [T, S]."""
+def _moments(positions: np.ndarray, logs: np.ndarray) -> tuple[Mixture, np.ndarray]:
+    """Return the averages, and the moments, of samples [T, S, 3] [m] with log-weights [T, S].
+
+    Also returns the effective shares of the samples, from 0 to 1, [T].
+    """
     weights, log_totals = mixture_weights(np.maximum(logs, _NEVER))
     means, covariances = moments(weights, positions)
     log_totals[np.isneginf(logs).all(axis=1)] = -np.inf
-    return Mixture._make((log_totals - np.log(logs.shape[1]), means, regular(covariances)))
+    return (Mixture._make((log_totals - np.log(logs.shape[1]), means, regular(covariances))),
+            1 / (logs.shape[1] * np.einsum('ts,ts->t', weights, weights)))

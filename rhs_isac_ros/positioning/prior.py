@@ -222,7 +222,7 @@ def inside(density: Sheets, bounds_m: np.ndarray, normal: np.ndarray, pose: Pose
     peaks = gaussians.logarithm(gaussians.nearest()[:, None])[:, 0]
     reaches = peaks - density.position().log_peaks >= np.log(_DENSITY)
     chosen = reaches if reaches.any() else np.ones(len(reaches), bool)
-    density, gaussians = select(density, chosen), gaussians.rows(chosen)
+    density, gaussians = select(density, chosen), select(gaussians, chosen)
     positions, log_ratio = gaussians.sample(normal)
     points = to_polar(positions)
     # The density of a position is that of (r, u, v) divided by the volume element.

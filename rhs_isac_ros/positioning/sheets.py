@@ -17,7 +17,7 @@ import numpy as np
 from rhs_isac_ros.model.arrays import mixture_weights, untied
 from rhs_isac_ros.model.gaussian import likelihood_loss, step_to_maximum, symmetric
 from rhs_isac_ros.model.geometry import jacobian, polar_derivative, to_polar, to_positions
-from rhs_isac_ros.model.pose import Pose
+from rhs_isac_ros.model.pose import Frames, Pose
 from rhs_isac_ros.positioning.mixture import Mixture, log_volume
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.templates import standard_normal
@@ -182,9 +182,9 @@ class Sheets(Mixture):
         """Return the density of r, u and v for a uniform prior on the positions."""
         return self.weighted(np.log(np.linalg.det(jacobian(self.means))))
 
-    def inside(self, bounds: np.ndarray, pose: Pose = _AT_SURFACE,
+    def inside(self, bounds: np.ndarray, pose: Pose | Frames = _AT_SURFACE,
                around: np.ndarray | None = None) -> 'Inside':
-        """Restrict the first three coordinates to a region; see `Inside`.
+        """Restrict the first three coordinates to a region, or a region each; see `Inside`.
 
         `around`, float64 [C, 3] [m], are positions in the region, by default those next to the
         maxima.
@@ -226,7 +226,8 @@ class Inside(NamedTuple):
     Positions and the region are in the frame in which the surface has the pose.
     """
 
-    pose: Pose
+    origin: np.ndarray  # Those of `Frames`.
+    rotation: np.ndarray
     log_values: np.ndarray  # a, float64 [M].
     points: np.ndarray  # (r [m], u, v), float64 [M, 3].
     gradient: np.ndarray  # g, float64 [M, 3].
@@ -243,19 +244,21 @@ class Inside(NamedTuple):
 
     @classmethod
     def of(cls, points: np.ndarray, gradient: np.ndarray, curvature: np.ndarray,
-           bounds: np.ndarray, pose: Pose = _AT_SURFACE, log_values: np.ndarray | None = None
-           ) -> 'Inside':
+           bounds: np.ndarray, pose: Pose | Frames = _AT_SURFACE,
+           log_values: np.ndarray | None = None) -> 'Inside':
         """Restrict Gaussians to the region between the bounds, [2, 3] or [2, M, 3] [m].
 
-        Takes the first four fields; `log_values` are 0 by default.
+        Takes the first four fields, by default `log_values` of 0, and the pose of the surface or
+        those of M surfaces.
         """
+        frames = pose.frames(len(points))
         if log_values is None:
             log_values = np.zeros(len(points))
-        positions = pose.vectors_to_site(to_positions(points))
-        derivative = polar_derivative(points) @ pose.rotation.T
+        positions = frames.vectors_to_site(to_positions(points))
+        derivative = polar_derivative(points) @ frames.rotation.swapaxes(1, 2)
         transposed = derivative.transpose(0, 2, 1)
         low, high = limits = np.empty((2, *points.shape))
-        limits[:] = (bounds - pose.origin).reshape(2, -1, 3)
+        limits[:] = bounds.reshape(2, -1, 3) - frames.origin
         extent = high - low
         known = np.sqrt(curvature.diagonal(axis1=1, axis2=2))
         known[:, 1:] /= points[:, :1]  # In standard deviations per metre.
@@ -280,7 +283,7 @@ class Inside(NamedTuple):
         # Places of the ordered axes in flat arrays, which `take` reads faster than an index.
         axes = order + 3 * np.arange(len(points))[:, None]
         return cls._in_order(
-            (pose, log_values, points, gradient, curvature), order, low.take(axes),
+            (*frames, log_values, points, gradient, curvature), order, low.take(axes),
             high.take(axes), centre.take(axes),
             precision.take(3 * axes[:, :, None] + order[:, None]),
             derivative[:, 0].take(axes), wide)
@@ -308,14 +311,9 @@ class Inside(NamedTuple):
         (ends,) = np.nonzero((last == self.low_m[:, 2]) | (last == self.high_m[:, 2]))
         if len(ends):
             # The other axes may compensate for a limit of the last one.
-            fixed = self.rows(ends)._at_end(last[ends])
+            fixed = select(self, ends)._at_end(last[ends])
             positions[ends] = fixed._positions(clipped, 1)[..., 0].T
-        return positions + self.pose.origin
-
-    def rows(self, chosen: np.ndarray) -> 'Inside':
-        """Return the Gaussians with these indices or in a mask."""
-        return self._replace(**{name: field[chosen] for name, field in self._asdict().items()
-                               if name != 'pose'})
+        return positions + self.origin
 
     def _at_end(self, last_m: np.ndarray) -> 'Inside':
         """Give the last axis a single value, [M] [m], and choose it first."""
@@ -323,7 +321,7 @@ class Inside(NamedTuple):
         low, high = self.low_m[:, turn], self.high_m[:, turn]
         low[:, 0] = high[:, 0] = last_m
         return self._in_order(
-            self[:5], self.order[:, turn], low, high, self.centre_m[:, turn],
+            self[:6], self.order[:, turn], low, high, self.centre_m[:, turn],
             self.precision[:, turn][:, :, turn], self.direction[:, turn],
             _is_wide(self.points, self.curvature, high - low))
 
@@ -345,12 +343,12 @@ class Inside(NamedTuple):
         # Half of the samples are on either side of the last axis' zero.
         sides = self._sides(np.where(np.arange(len(normal)) < len(normal) // 2, 1.0, -1.0))
         positions = self._positions(truncated, len(normal), sides)
-        return (positions.transpose(1, 2, 0) + self.pose.origin,
+        return (positions.transpose(1, 2, 0) + self.origin[:, None],
                 log_ratio + self._log_share(sides))
 
     def log_ratio(self, positions: np.ndarray) -> np.ndarray:
         """Return the second result of `sample` at positions [M, S, 3] [m] in the region."""
-        places = (positions - self.pose.origin).transpose(2, 0, 1)
+        places = (positions - self.origin[:, None]).transpose(2, 0, 1)
         places = places[self.order.T, np.arange(len(positions))]
         log_ratio = np.zeros(places.shape[1:])
 
@@ -391,10 +389,10 @@ class Inside(NamedTuple):
         found &= 2 * by_range * range_m * np.abs(last) > _SEPARATE * np.sqrt(total)
         rows = np.flatnonzero(found)
         if len(rows):
-            far_side = self.pose.vectors_to_site(to_positions(self.points[rows]))
+            chosen = select(self, rows)
+            far_side = Frames(*chosen[:2]).vectors_to_site(to_positions(chosen.points))
             far_side[np.arange(len(rows)), axis[rows]] *= -1
-            likelihood = self.rows(rows).logarithm(
-                (far_side + self.pose.origin)[:, None])[:, 0]
+            likelihood = chosen.logarithm((far_side + chosen.origin)[:, None])[:, 0]
             found[rows] = likelihood - self.log_values[rows] > -_FAR_SIDE
         return found
 
@@ -410,7 +408,7 @@ class Inside(NamedTuple):
 
     def logarithm(self, positions: np.ndarray) -> np.ndarray:
         """Evaluate the logarithms of the Gaussians at positions [M, S, 3] [m], float64 [M, S]."""
-        positions = self.pose.to_surface(positions)
+        positions = Frames(*self[:2]).to_surface(positions)
         # No user behind the surface is in sight.
         return np.where(positions[..., 0] > 0, log_values(
             positions, self.points, self.curvature, self.log_values, self.gradient), -np.inf)
@@ -459,7 +457,7 @@ class Inside(NamedTuple):
             on_sphere = np.where(sides < 0, -on_sphere, on_sphere)
         mean, std = mean + by_range / total * (on_sphere - mean), 1 / np.sqrt(total)
         if (wide := self.wide).any():
-            mean[wide], std[wide] = self.rows(wide)._along(chosen[:, wide], mean[wide])
+            mean[wide], std[wide] = select(self, wide)._along(chosen[:, wide], mean[wide])
         return mean, std
 
     def _along(self, chosen: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -467,11 +465,11 @@ class Inside(NamedTuple):
 
         They follow from the derivatives of range and directions at these values.
         """
-        rotation = self.pose.rotation
         positions, rows = np.empty((3, *last.shape)), np.arange(len(last))
         for axis, values in enumerate((*chosen[:2], last)):
             positions[self.order[:, axis], rows] = values
-        sight, along = np.einsum('ba,bmn->amn', rotation, positions), rotation[self.order[:, 2]].T
+        sight, along = np.einsum('mba,bmn->amn', self.rotation, positions), self.rotation[
+            rows, self.order[:, 2]].T
         range_m = np.sqrt(np.sum(sight**2, axis=0))
         sight /= range_m
         slope = np.einsum('am,amn->mn', along, sight)
@@ -521,17 +519,21 @@ def _is_wide(points: np.ndarray, curvature: np.ndarray, extent: np.ndarray) -> n
 
 
 def move_inside(points: np.ndarray, curvature: np.ndarray, bounds: np.ndarray,
-                pose: Pose = _AT_SURFACE) -> np.ndarray:
-    """Return the most likely points inside the region for Gaussians around points [M, 3]."""
+                pose: Pose | Frames = _AT_SURFACE) -> np.ndarray:
+    """Return the most likely points inside the region for Gaussians around points [M, 3].
+
+    Bounds and poses are those of `Inside.of`.
+    """
     positions = pose.to_site(to_positions(points))
     (outside,) = np.nonzero(((positions < bounds[0]) | (positions > bounds[1])).any(axis=1))
     moved = points.copy()
     if len(outside):
-        start = to_polar(pose.to_surface(np.clip(positions[outside], *bounds)))
-        curvature = curvature[outside]
+        frames, curvature = select(pose.frames(len(points)), outside), curvature[outside]
+        bounds = np.broadcast_to(bounds.reshape(2, -1, 3), (2, *points.shape))[:, outside]
+        start = to_polar(frames.to_surface(np.clip(positions[outside], *bounds)))
         gradient = np.matmul(curvature, (points[outside] - start)[..., None])[..., 0]
-        moved[outside] = to_polar(pose.to_surface(
-            Inside.of(start, gradient, curvature, bounds, pose).nearest()))
+        moved[outside] = to_polar(frames.to_surface(
+            Inside.of(start, gradient, curvature, bounds, frames).nearest()))
     return moved
 
 

@@ -1,7 +1,7 @@
 """Values of a function for the arguments of its most recent calls."""
 
 import collections
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any, Generic, TypeVar
 
 _Key = TypeVar('_Key', bound=Hashable)
@@ -44,6 +44,12 @@ class Recent(Generic[_Key, _Value]):
         if len(self._values) > self._n_kept:
             self._values.popitem(last=False)
         return value
+
+    def keep(self, keys: Iterable[_Key],
+             compute: Callable[[Sequence[_Key]], Iterable[_Value]]) -> None:
+        """Compute the values of those keys that have none with one call."""
+        if new := [key for key in keys if key not in self._values]:
+            self._values.update(zip(new, compute(new), strict=True))
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy has."""

@@ -27,6 +27,13 @@ def test_the_values_of_the_most_recent_arguments_are_kept():
     assert squares.computed == [1, 2, 3, 2]
 
 
+def test_values_without_an_argument_are_computed_together():
+    squares, calls = Squares(), []
+    squares.of(3)
+    squares.of.keep([2, 3], lambda new: calls.append(new) or [0])
+    assert (calls, squares.of(2), squares.of(3)) == ([[2]], 0, 9)
+
+
 def test_a_value_of_none_is_kept_too():
     calls = []
     found = Recent(calls.append, 1)
