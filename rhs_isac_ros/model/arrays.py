@@ -99,8 +99,14 @@ def gauss_legendre(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def digest(*arrays: np.ndarray) -> str:
-    """Return 16 hexadecimal digits that identify the bytes of little-endian arrays."""
-    return hashlib.sha256(b''.join(array.tobytes() for array in arrays)).hexdigest()[:16]
+    """Return 16 hexadecimal digits that identify the bytes of arrays, in little-endian order."""
+    return hashlib.sha256(b''.join(array.astype(array.dtype.newbyteorder('<')).tobytes()
+                                   for array in arrays)).hexdigest()[:16]
+
+
+def to_tuples(entry: Any) -> Any:
+    """Return nested lists as tuples, which are hashable."""
+    return tuple(map(to_tuples, entry)) if isinstance(entry, list) else entry
 
 
 def all_finite(values: np.ndarray) -> bool:

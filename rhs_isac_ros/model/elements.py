@@ -105,7 +105,7 @@ class ElementErrors(SurfaceModel):
     @property
     def id(self) -> str:
         """Hash of the errors, 16 hexadecimal digits."""
-        return digest(np.asarray(self.gains, '<c16'), np.asarray(self.stuck, '<f8'))
+        return digest(self.gains, self.stuck)
 
     @property
     def response(self) -> Response:
@@ -201,8 +201,7 @@ class SurfaceEstimate(SurfaceModel):
     @property
     def id(self) -> str:
         """Hash of the estimate without `failed_probability`, 16 hexadecimal digits."""
-        return digest(*(np.asarray(array, '<c16') for array in (
-            self.gains, self.offsets, self.band_gains, self.factor)))
+        return digest(self.gains, self.offsets, self.band_gains, self.factor)
 
     @property
     def failed(self) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import adjoint, numbers, read_only
+from rhs_isac_ros.model.arrays import adjoint, numbers, read_only, to_tuples
 from rhs_isac_ros.model.board import (
     Board,
     BoardError,
@@ -227,7 +227,7 @@ class States(Elementwise):
         if not 2 <= table.ndim <= 4 or table.shape[-1] != 2 or table.shape[-2] < 2:
             raise BoardError(f'states: shape {table.shape}, expected [L, 2], [N_B, L, 2] or '
                              '[N_B, N_E, L, 2] with at least two states')
-        object.__setattr__(self, 'states', _tuples(table.tolist()))
+        object.__setattr__(self, 'states', to_tuples(table.tolist()))
 
     @functools.cached_property
     def _table(self) -> np.ndarray:
@@ -284,7 +284,3 @@ def matched_configuration(los: np.ndarray, onboard: np.ndarray) -> np.ndarray:
     """
     interference = np.einsum('jm,jkm->m', los, onboard).real
     return (interference / (np.abs(interference).max() or 1.0) + 1) / 2
-
-
-def _tuples(entry: Any) -> Any:
-    return tuple(map(_tuples, entry)) if isinstance(entry, list) else entry

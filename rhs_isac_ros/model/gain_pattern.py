@@ -64,7 +64,7 @@ class GainPattern(External):
             raise PatternError('gain 0 at all angles below pi/2, expected a positive gain')
         content = gains if slope is None else np.concatenate([gains, self.slope(_ANGLES)])
         # Single precision, because machines may round the last digit of a sine differently.
-        self.digest = digest(content.astype('<f4'))
+        self.digest = digest(content.astype(np.float32))
 
     def amplitude(self, angles: np.ndarray) -> np.ndarray:
         """Return the amplitude gains, float64, at angles from the boresight [rad]."""

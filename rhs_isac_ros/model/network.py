@@ -88,8 +88,7 @@ class Admittances(NamedTuple):
             for name in _LOADS]
         feeds, between, elements = arrays
         network = cls(frequencies, feeds, between, elements, conductance, slope,
-                      digest(*(np.ascontiguousarray(array, array.dtype.newbyteorder('<'))
-                               for array in (frequencies, *arrays, *loads))))
+                      digest(frequencies, *arrays, *loads))
         network._check()
         return network
 

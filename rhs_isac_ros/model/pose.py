@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rhs_isac_ros.model.arrays import cross, numbers, read_only
+from rhs_isac_ros.model.arrays import cross, numbers, read_only, to_tuples
 
 # Smallest eigenvalue of a covariance relative to the largest one, up to rounding.
 _MIN_EIGENVALUE = -1e-9
@@ -64,7 +64,7 @@ class Pose:
             _check_covariance('uncertainty', uncertainty)
         for name, array in (('position_m', position), ('quaternion', quaternion),
                             ('uncertainty', uncertainty)):
-            object.__setattr__(self, name, _nested(array))
+            object.__setattr__(self, name, to_tuples(array.tolist()))
 
     @functools.cached_property
     def origin(self) -> np.ndarray:
@@ -146,8 +146,8 @@ class Pose:
         shift, turn = np.split(numbers('error', error), 2)
         angle = float(np.linalg.norm(turn))
         half = np.append(turn * np.sinc(angle / (2 * math.pi)) / 2, math.cos(angle / 2))
-        moved = _nested(self.origin + shift)
-        turned = _nested(quaternion_product(half, self.unit_quaternion))
+        moved = (self.origin + shift).tolist()
+        turned = quaternion_product(half, self.unit_quaternion).tolist()
         return dataclasses.replace(self, position_m=moved, quaternion=turned)
 
     def error_of(self, other: 'Pose') -> np.ndarray:
@@ -229,8 +229,3 @@ def _check_covariance(name: str, matrix: np.ndarray) -> None:
     if (np.abs(matrix - matrix.T) > 1e-9 * scale).any() or values[0] < _MIN_EIGENVALUE * scale:
         raise ValueError(f'{name}: smallest eigenvalue {values[0]:g}, expected a symmetric matrix '
                          'without negative eigenvalues')
-
-
-def _nested(array: np.ndarray) -> Any:
-    """Return an array as tuples, which are hashable."""
-    return tuple(map(_nested, array)) if array.ndim else float(array)
