@@ -10,6 +10,14 @@ _RESAMPLES = 2000
 _INTERVAL = (2.5, 97.5)
 
 
+class Interval(NamedTuple):
+    """A value and the ends of its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
 class Replicates(NamedTuple):
     """A statistic over several members and cases, with its replicates from the bootstrap.
 
@@ -27,11 +35,11 @@ class Replicates(NamedTuple):
         return Replicates(
             self.values - other.values, self.by_member - other.by_member, self.n_members)
 
-    def interval(self) -> tuple[float, float, float]:
+    def interval(self) -> Interval:
         """Return the statistic and its 95 % interval."""
         return _interval(self.values, [(self.by_member, self.n_members)])
 
-    def reduction_from(self, baseline: 'Replicates') -> tuple[float, float, float]:
+    def reduction_from(self, baseline: 'Replicates') -> Interval:
         """Return the reduction relative to a baseline, and its 95 % interval [%].
 
         The cases are paired if both statistics have the same number of cases.
@@ -42,7 +50,7 @@ class Replicates(NamedTuple):
                 (self.values[0], baseline.by_member)))
         ratio, low, high = _interval(
             ratios, [(own, self.n_members), (other, baseline.n_members)])
-        return 100 * (1 - ratio), 100 * (1 - high), 100 * (1 - low)
+        return Interval(100 * (1 - ratio), 100 * (1 - high), 100 * (1 - low))
 
 
 def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -> list[Replicates]:
@@ -74,7 +82,7 @@ def replicate(results: np.ndarray, seed: int, quantiles: Sequence[float] = ()) -
     return [Replicates(*rows, n_members) for rows in zip(values, by_member, strict=True)]
 
 
-def share_percent(count: int, total: int) -> tuple[float, float, float]:
+def share_percent(count: int, total: int) -> Interval:
     """Return `count` relative to `total` [%], and the ends of Wilson's 95 % interval [%]."""
     if total < 1:
         raise ValueError(f'total: {total}, expected at least 1')
@@ -82,7 +90,8 @@ def share_percent(count: int, total: int) -> tuple[float, float, float]:
     z2 = float(ndtri(0.975))**2
     centre = (count + z2 / 2) / (total + z2)
     half = np.sqrt(z2 * (count * (total - count) / total + z2 / 4)) / (total + z2)
-    return 100 * count / total, 100 * float(centre - half), 100 * float(centre + half)
+    return Interval(
+        100 * count / total, 100 * float(centre - half), 100 * float(centre + half))
 
 
 def _mean(results: np.ndarray, members: np.ndarray, cases: np.ndarray) -> np.ndarray:
@@ -107,8 +116,7 @@ def _quantiles(results: np.ndarray, members: np.ndarray, cases: np.ndarray,
     return found
 
 
-def _interval(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
-              ) -> tuple[float, float, float]:
+def _interval(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]) -> Interval:
     """Return the first value, and the 95 % interval of the other values, its replicates.
 
     With few members, the percentiles are too close to the statistic. Their distances from it are
@@ -119,13 +127,11 @@ def _interval(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
     with np.errstate(invalid='ignore'):
         if all(np.nanmin(array) > 0 for array in (values, *(part for part, _ in parts))):
             logarithms = _spread(np.log(values), [(np.log(part), n) for part, n in parts])
-            value, low, high = np.exp(logarithms)
-            return float(value), float(low), float(high)
+            return Interval(*np.exp(logarithms).tolist())
         return _spread(values, parts)
 
 
-def _spread(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
-            ) -> tuple[float, float, float]:
+def _spread(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]) -> Interval:
     # Division by zero yields infinite ratios, between which percentiles must not interpolate.
     low, high = np.nanpercentile(values[1:], _INTERVAL, method='inverted_cdf')
     total = np.nanvar(values[1:])**2
@@ -134,8 +140,8 @@ def _spread(values: np.ndarray, parts: Sequence[tuple[np.ndarray, int]]
     if uncertain > 0 and np.isfinite(total):
         from scipy.special import ndtri, stdtrit
         widening = float(stdtrit(max(total / uncertain, 1.0), 0.975) / ndtri(0.975))
-    return (float(values[0]), float(values[0] + widening * (low - values[0])),
-            float(values[0] + widening * (high - values[0])))
+    return Interval(float(values[0]), float(values[0] + widening * (low - values[0])),
+                    float(values[0] + widening * (high - values[0])))
 
 
 @functools.lru_cache(maxsize=2)

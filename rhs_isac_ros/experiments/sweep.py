@@ -16,14 +16,8 @@ from rhs_isac_ros.bounds import global_bound
 from rhs_isac_ros.codebook import Codebook, CodebookError
 from rhs_isac_ros.codebook.optimize import optimised
 from rhs_isac_ros.codebook.unoptimised import STARTS
-from rhs_isac_ros.experiments.sweep_settings import (
-    FIELDS,
-    MEASURES,
-    Interval,
-    Setting,
-    measured,
-    plain,
-)
+from rhs_isac_ros.experiments.resampling import Interval
+from rhs_isac_ros.experiments.sweep_settings import FIELDS, MEASURES, Setting, measured, plain
 from rhs_isac_ros.link import capacity as capacity_of
 from rhs_isac_ros.link import capacity_report, choose_beam
 from rhs_isac_ros.model import Scenario

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.experiments.resampling import replicate, share_percent
+from rhs_isac_ros.experiments.resampling import Interval, replicate, share_percent
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.scenario import as_plain, checked
 from rhs_isac_ros.support import plugins
@@ -52,14 +52,6 @@ MEASURES: Mapping[str, Measure] = {
 }
 
 
-class Interval(NamedTuple):
-    """A value and the ends of its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-
 @one_blas_thread
 def measured(measure: Measure, results: np.ndarray) -> Interval:
     """Return a measure of results, float64 [codebooks, positions], with its interval.
@@ -72,7 +64,7 @@ def measured(measure: Measure, results: np.ndarray) -> Interval:
         return Interval(np.nan, np.nan, np.nan)
     if measure.share and (len(results) == 1 or np.ptp(results) == 0):
         # Codebooks share their positions and therefore do not count as additional samples.
-        return Interval(*share_percent(int(results[0].sum()), len(results[0])))
+        return share_percent(int(results[0].sum()), len(results[0]))
     if measure.quantile is None and np.isinf(results).any():
         return Interval(np.inf, np.nan, np.nan)
     finite = np.minimum(results, _INFINITE)

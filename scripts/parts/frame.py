@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from rhs_isac_ros.codebook import Codebook, CodebookError
-from rhs_isac_ros.experiments.resampling import replicate, share_percent
+from rhs_isac_ros.experiments.resampling import Interval, replicate, share_percent
 from rhs_isac_ros.experiments.sweep import with_power
 from rhs_isac_ros.model import Scenario, ScenarioError
 from rhs_isac_ros.positioning import Estimate, Estimator, ModelError
@@ -39,8 +39,6 @@ CONFIG = Path(__file__).parents[2] / 'config'
 SYSTEMS = {'table1': ('table1.yaml', 'codebook_ambiguity.yaml'),
            'bandplan': ('bandplan.yaml', 'codebook_bandplan.yaml')}
 _FILES = {**SYSTEMS, 'lab_walk': ('lab_walk.yaml', 'codebook_lab.yaml')}
-# A value and the ends of its 95 % interval.
-Interval = tuple[float, float, float]
 # Squared Mahalanobis radius of the 95 % region of an estimate.
 _REGION_RADIUS = float(chdtri(3, 0.05))
 _RESAMPLES = 2000
@@ -230,14 +228,14 @@ def mean_interval(samples: np.ndarray, group: np.ndarray | None = None,
     sums, counts = np.bincount(index, samples), np.bincount(index, relative_to)
     picks = np.random.default_rng(0).integers(len(sums), size=(_RESAMPLES, len(sums)))
     low, high = np.percentile(sums[picks].sum(axis=1) / counts[picks].sum(axis=1), (2.5, 97.5))
-    return float(sums.sum() / counts.sum()), float(low), float(high)
+    return Interval(float(sums.sum() / counts.sum()), float(low), float(high))
 
 
 def ratio(results: np.ndarray, baseline: np.ndarray) -> Interval:
     """Return the ratio of two means over members and cases, with its interval by `replicate`."""
     own, other = (replicate(one, 0)[0] for one in (results, baseline))
     value, low, high = own.reduction_from(other)
-    return 1 - value / 100, 1 - high / 100, 1 - low / 100
+    return Interval(1 - value / 100, 1 - high / 100, 1 - low / 100)
 
 
 class Fixes(NamedTuple):

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from rhs_isac_ros.experiments.resampling import Interval
 from rhs_isac_ros.experiments.sweep import Point
 from rhs_isac_ros.experiments.sweep_picture import draw, shown
-from rhs_isac_ros.experiments.sweep_settings import Interval, parse_axis, settings_of
+from rhs_isac_ros.experiments.sweep_settings import parse_axis, settings_of
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.support.pictures import write_picture
 
