@@ -35,7 +35,7 @@ from rhs_isac_ros.model.boards import board_of
 from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.support.files import read_arrays, write_archive
-from rhs_isac_ros.support.jobs import Job, Strand, Workers
+from rhs_isac_ros.support.jobs import Job, Workers, results_of
 
 # Maximum number of pilots whose errors before and after the calibration are compared, and number
 # of groups of places that are left out one by one.
@@ -106,10 +106,7 @@ class PilotWork:
         jobs = [Job.of(task, {**self._known, 'task': task, **each})
                 for task, options in zip(tasks[::2], tasks[1::2], strict=True)
                 for each in options]
-
-        def strand() -> Strand[list[dict[str, Any]]]:
-            return (yield answered, jobs)
-        (found,) = self._workers.run([strand()])
+        (found,) = self._workers.run([results_of(answered, jobs)])
         for one in found:
             if 'refused' in one:
                 raise CalibrationError(one['refused'])

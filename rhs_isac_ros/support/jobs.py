@@ -472,6 +472,12 @@ def _interrupts_ignored() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
+def results_of(
+        function: Function, jobs: Sequence[Job]) -> Strand[list[dict[str, Any]]]:
+    """Return the results of jobs, as a strand."""
+    return (yield function, jobs)
+
+
 def run_jobs(
         function: Callable[..., dict[str, Any]], jobs: Sequence[Job],
         folder: str | Path | None = None, n_jobs: int = -1, dask: str | None = None
@@ -492,8 +498,6 @@ def run_jobs(
     if len({job.name for job in jobs}) < len(jobs):
         raise ValueError('jobs: two have the same name, expected unique names')
 
-    def strand() -> Strand[list[dict[str, Any]]]:
-        return (yield function, jobs)
-
-    (results,) = Workers(n_jobs, dask, Path(folder) if folder else None).run([strand()])
+    (results,) = Workers(n_jobs, dask, Path(folder) if folder else None).run(
+        [results_of(function, jobs)])
     return results
