@@ -12,7 +12,6 @@ from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
-from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
 from rhs_isac_msgs.action import Locate
@@ -21,7 +20,7 @@ from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol.base_station import BaseStation
 from rhs_isac_ros.ros import convert, topics
 from rhs_isac_ros.ros.cdr import TINY
-from rhs_isac_ros.ros.endpoints import SERVICES, create_or_refuse, steady_timer
+from rhs_isac_ros.ros.endpoints import SERVICES, create_or_refuse, once
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.support import streams
@@ -54,7 +53,7 @@ class _Slots:
             future: Future = Future()
             self._waiting.append(future)
             if len(self._waiting) == 1:
-                _later(self._node, delay_s, self._end_slot)
+                once(self._node, delay_s, self._end_slot)
             await future
         else:
             self._begin_slot()
@@ -72,16 +71,7 @@ class _Slots:
         length_s = self._begin_slot()
         self._waiting.popleft().set_result(None)
         if self._waiting:
-            _later(self._node, length_s, self._end_slot)
-
-
-def _later(node: Node, delay_s: float, callback: Callable[[], None]) -> Timer:
-    """Call a function once after a delay; return its timer."""
-    def once() -> None:
-        node.destroy_timer(timer)
-        callback()
-    timer = steady_timer(node, max(delay_s, 1e-3), once)
-    return timer
+            once(self._node, length_s, self._end_slot)
 
 
 @dataclasses.dataclass(eq=False)
@@ -144,7 +134,7 @@ class LocateServer:
         for goal in list(self._goals):
             self._end(goal, 'the base station ends or stands by')
         if delay_s:
-            _later(self._node, delay_s, self._withdraw)
+            once(self._node, delay_s, self._withdraw)
         else:
             self._withdraw()
 
@@ -172,14 +162,14 @@ class LocateServer:
         for goal in self._goals:
             if goal.handle.goal_id == handle.goal_id:
                 # Not at once: the handle enters the state CANCELING after this callback.
-                _later(self._node, 0.0, functools.partial(self._end, goal, 'canceled'))
+                once(self._node, 0.0, functools.partial(self._end, goal, 'canceled'))
         return CancelResponse.ACCEPT
 
     async def _execute(self, handle: Any) -> Locate.Result:
         goal = _Goal(handle, Future())
         self._goals.append(goal)
         timeout_s = handle.request.timeout_s or _DEFAULT_TIMEOUT_S
-        timer = _later(self._node, timeout_s, lambda: self._end(goal, (
+        timer = once(self._node, timeout_s, lambda: self._end(goal, (
             'no position' if goal.has_answered else
             f'user {handle.request.user} has answered no beacon') + f' within {timeout_s:g} s'))
         self._feed_back(goal, m.Phase.BEACONING)

@@ -108,6 +108,15 @@ def steady_timer(node: Node, period_s: float, callback: Callable[[], float | Non
     return timer
 
 
+def once(node: Node, delay_s: float, callback: Callable[[], None]) -> Timer:
+    """Call a function once after a delay on the steady clock; return its timer."""
+    def call() -> None:
+        node.destroy_timer(timer)
+        callback()
+    timer = steady_timer(node, max(delay_s, 1e-3), call)
+    return timer
+
+
 @runtime_checkable
 class _OfRole(Protocol):
     """A node of a role, which counts failures of plug-ins."""

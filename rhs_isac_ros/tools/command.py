@@ -123,13 +123,12 @@ def observe(
 def expecting_cycles(node: _NodeT, delay_s: float = 3.0) -> _NodeT:
     """Return a node that logs a warning if base stations run only in other namespaces."""
     def examine() -> None:
-        timer.cancel()
         spaces = {space for name, space in node.get_node_names_and_namespaces() if name == 'bs'}
         if spaces and node.get_namespace() not in spaces:
             node.get_logger().warning(  # type: ignore[no-untyped-call]
                 f'no base station in the namespace {node.get_namespace()}; select one with '
                 f'--ros-args -r __ns:=NAME: {", ".join(sorted(spaces))}')
-    timer = endpoints.steady_timer(node, delay_s, examine)
+    endpoints.once(node, delay_s, examine)
     return node
 
 

@@ -71,7 +71,7 @@ class ViewNode(Node):
         endpoints.subscribe_messages(
             self, RECEIVES, scenario, self._on_message, self._on_mismatch,
             exchange=endpoints.OBSERVATION)
-        self._silence_timer = endpoints.steady_timer(self, _SILENCE_S, self._log_silence)
+        endpoints.once(self, _SILENCE_S, self._log_silence)
 
     @property
     def silence(self) -> str:
@@ -81,7 +81,6 @@ class ViewNode(Node):
                 f'no cycle in the domain {domain} and the namespace {self._namespace}')
 
     def _log_silence(self) -> None:
-        self._silence_timer.cancel()
         if not self.view.n_cycles:
             self._warn(f'{self.silence}; still waiting')
 
