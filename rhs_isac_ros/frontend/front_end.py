@@ -80,8 +80,9 @@ class FrontEnd:
 
     def _receive(self, sounding: Sounding, captures: list[np.ndarray], times_s: np.ndarray
                  ) -> np.ndarray:
-        # The captures may have any size.
+        # The captures may have any size. A modem may skip samples that are no numbers.
         with translated(ValueError, RadioFault):
             return numbers('signals', self._radio.modem.receive(
-                sounding.cycle_id, np.array(captures), sounding.symbols, sounding.band, times_s),
+                sounding.cycle_id, numbers('captures', np.array(captures), complex),
+                sounding.symbols, sounding.band, times_s),
                 complex, shapes=[sounding.arriving.shape])

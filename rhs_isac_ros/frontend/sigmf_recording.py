@@ -332,6 +332,9 @@ def _streams(path: Path, scenario: Scenario, skip_checksum: bool = False
     with translated(Exception, ValueError, f'{path}: cannot be read'), warnings.catch_warnings():
         warnings.simplefilter('ignore')
         collection = sigmf.fromfile(path, skip_checksum=skip_checksum)
+        if not isinstance(collection, sigmf.SigMFCollection):
+            raise ValueError('a single stream or an archive, expected a collection of streams, '
+                             '*.sigmf-collection, beside their files')
         feeds = [feed for name in collection.get_stream_names()
                  if (feed := collection.get_SigMFFile(name)).get_global_field(_FEED) is not None]
     feeds.sort(key=lambda feed: feed.get_global_field(_FEED))
@@ -353,6 +356,8 @@ def _streams(path: Path, scenario: Scenario, skip_checksum: bool = False
 def _frames(feed: Any, scenario: Scenario) -> list[_Frame]:
     """Return the frames of a stream in the order of the measurements, all of them complete."""
     about, captures = feed.get_global_info(), feed.get_captures()
+    if feed.data_file is None:
+        raise ValueError('no samples, expected a file *.sigmf-data beside the metadata')
     _expect('core:datatype', about.get('core:datatype'), *_READABLE)
     _expect('core:num_channels', about.get('core:num_channels', 1), 1)
     _expect('core:trailing_bytes', about.get('core:trailing_bytes', 0), 0)

@@ -73,10 +73,11 @@ def test_nothing_is_measured_after_a_fault(fails, kind, n):
     assert len(parts.calls) == n
 
 
-@pytest.mark.parametrize('capture', [
-    np.ones((1, 1)), np.full((2, 1), np.nan), np.ones((0, 1))])
-def test_captures_of_another_size_are_a_fault_of_the_radio(capture):
-    with pytest.raises(RadioFault, match='^signals: .*, expected '):
+@pytest.mark.parametrize(('capture', 'name'), [
+    (np.ones((1, 1)), 'signals'), (np.ones((0, 1)), 'signals'),
+    (np.full((2, 1), np.nan), 'captures')])
+def test_captures_of_another_size_are_a_fault_of_the_radio(capture, name):
+    with pytest.raises(RadioFault, match=f'^{name}: .*, expected '):
         sound(Recording(capture=capture))
 
 

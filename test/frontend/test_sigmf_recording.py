@@ -330,6 +330,23 @@ def test_incomplete_data_are_refused_before_the_first_cycle(tmp_path):
         edited.play()
 
 
+def test_samples_that_are_no_numbers_are_a_fault_of_the_radio(tmp_path):
+    # After the end of the frame, where the synchronisation might not look.
+    edited = Edited(tmp_path)
+    edited.data[1][100:110] = np.nan
+    with pytest.raises(RadioFault, match='^captures: .*, expected '):
+        edited.play()
+
+
+def test_streams_without_data_and_files_that_are_no_collections_are_named(tmp_path):
+    edited = Edited(tmp_path)
+    with pytest.raises(ValueError, match='a single stream or an archive, expected a collection'):
+        playback(edited.file(edited.names[0], 'meta'))
+    edited.file(edited.names[1], 'data').unlink()
+    with pytest.raises(ValueError, match='feed 1: no samples, expected a file'):
+        playback(tmp_path)
+
+
 def test_a_later_collection_is_checked_at_the_start(tmp_path):
     record(tmp_path, cycles(1))
     Edited(tmp_path)  # Another one.
