@@ -1,6 +1,7 @@
 """The likelihood with the covariance of element errors at each position."""
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -9,6 +10,8 @@ import numpy as np
 from rhs_isac_ros.model import MeasurementModel
 from rhs_isac_ros.model.arrays import adjoint, mixture_weights, multiply_rows
 from rhs_isac_ros.model.gaussian import covariance_root
+from rhs_isac_ros.model.geometry import element_positions, polar_bounds, to_polar
+from rhs_isac_ros.model.los import los_waves
 from rhs_isac_ros.positioning.likelihood import (
     Columns,
     Conditional,
@@ -19,6 +22,7 @@ from rhs_isac_ros.positioning.likelihood import (
     assemble,
 )
 from rhs_isac_ros.positioning.nuisance import NuisancePrior
+from rhs_isac_ros.support import streams
 
 # Numbers of failures to average over: smallest probability of each, and how many at most.
 _MIN_PROBABILITY = 1e-5
@@ -28,6 +32,83 @@ _MAX_BYTES = 1 << 23
 # Share of the whitened energy up to which errors of an estimated surface need no covariance for
 # each position.
 _MIN_ERROR_SHARE = 0.05
+# Interpolated covariances: highest powers; largest Frobenius norm of the error of a whitened one,
+# and number of points at which it is measured; and memory of covariances at points [bytes].
+_POWERS = 2, 3, 5
+_MAX_ERROR, _N_TESTS = 1e-5, 16
+_POINT_BYTES = 1 << 26
+
+
+class InterpolatedCovariance:
+    """The covariance of signals at positions in the region, for declared errors of elements.
+
+    The errors of the direct path are independent. Each element thus adds the products of its gains
+    in any two sub-bands, whose carriers cancel. Relative to the products of one element, these are
+    smooth functions of 1/r, u and v, as the surface is small and turns little over the sub-bands.
+    Polynomials are fitted to exact covariances, with as few powers as the error allows.
+    """
+
+    def __init__(self, model: MeasurementModel, power: int) -> None:
+        scenario = self._scenario = model.scenario
+        self._constant = model.covariance_in_shadow()
+        self._powers = np.array([
+            powers for powers in itertools.product(range(power + 1), repeat=3)
+            if powers[1] + powers[2] <= power])
+        self._middle = [int(np.argmin(np.sum(element_positions(scenario)**2, axis=1)))]
+        low, high = scenario.roi_bounds_m
+        self._limits = np.sort(_smooth(polar_bounds(scenario.roi_bounds_m)), axis=0)
+        n = 2 * len(self._powers)
+        places = low + (high - low) * streams.unit_points()[:n + _N_TESTS]
+        exact, gains = model.covariance_at(places), self._gains(places[:n])
+        smooth = (exact[:n] - self._constant) / gains[..., None] / gains.conj()[:, :, None]
+        self._coefficients = np.linalg.lstsq(
+            self._polynomials(places[:n]), smooth.reshape(n, -1).view(float), rcond=None)[0]
+        errors = model.whitener @ (self(places[n:]) - exact[n:]) @ adjoint(model.whitener)
+        #: Largest norm of the error of a whitened covariance.
+        self.error = float(np.linalg.norm(errors, axis=(2, 3)).max())
+
+    @classmethod
+    def of(cls, model: MeasurementModel) -> Callable[[np.ndarray], np.ndarray]:
+        """Return `MeasurementModel.covariance_at`, interpolated if this is accurate."""
+        n_bytes = model.covariance_in_shadow().nbytes
+        for power in _POWERS if model.surface is None and not model.elements.is_exact else ():
+            if (power + 1)**2 * (power + 2) * n_bytes > _POINT_BYTES:
+                break
+            if (found := cls(model, power)).error <= _MAX_ERROR:
+                return found
+        return model.covariance_at
+
+    def __call__(self, positions: np.ndarray) -> np.ndarray:
+        """Return covariances at positions [M, 3] [m], complex128 [M, N_B, N_SB F, N_SB F]."""
+        found = (self._polynomials(positions) @ self._coefficients).view(complex).reshape(
+            len(positions), *self._constant.shape)
+        gains = self._gains(positions)
+        found *= gains[..., None]
+        found *= gains.conj()[:, :, None]
+        found += self._constant
+        return found
+
+    def _polynomials(self, positions: np.ndarray) -> np.ndarray:
+        """Return products of powers at positions [M, 3], float64 [M, K]."""
+        # Beyond the region, high powers would grow.
+        low, high = self._limits
+        scaled = (2 * np.clip(_smooth(to_polar(positions)), low, high) - low - high) / np.where(
+            high > low, high - low, 1.0)
+        values = scaled[:, :, None]**np.arange(self._powers.max() + 1)
+        products: np.ndarray = np.prod(
+            [values[:, axis, self._powers[:, axis]] for axis in range(3)], axis=0)
+        return products
+
+    def _gains(self, positions: np.ndarray) -> np.ndarray:
+        """Return gains of an element in the middle, in any unit, complex128 [M, N_B, N_SB F]."""
+        waves, _, _ = los_waves(
+            self._scenario, positions, range(self._scenario.n_bands), self._middle, slopes=False)
+        return np.moveaxis(waves[..., 0], 2, 0).repeat(self._scenario.n_frames, axis=2)
+
+
+def _smooth(points: np.ndarray) -> np.ndarray:
+    """Return 1/r, u and v of points (r [m], u, v), float64 [M, 3]."""
+    return np.column_stack([1 / points[:, 0], points[:, 1:]])
 
 
 class DispersedLikelihood(Conditional):
@@ -47,6 +128,8 @@ class DispersedLikelihood(Conditional):
             dataclasses.replace(scenario, failed_element_share=share), likelihood.codebook,
             likelihood.surface).prepare()
         self._intact = MeasurementModel(intact, likelihood.codebook, likelihood.surface)
+        self._intact_at = InterpolatedCovariance.of(self._intact)
+        self._average_at = InterpolatedCovariance.of(self._average) if share else self._intact_at
         self._scales, log_weights = _failure_counts(scenario.n_elements, share)
         self._offsets = log_weights + likelihood.log_det
         roots = covariance_root(scenario, self._covariances(MeasurementModel.covariance))
@@ -88,9 +171,9 @@ class DispersedLikelihood(Conditional):
         users, by_unknown = self._base.nuisance.states(points, values, moves, turns)
         positions = users[:, :3]
         # Without errors, an intact surface has the same covariance at all points.
-        intact = self._intact.covariance_at(
+        intact = self._intact_at(
             positions[:1] if self._intact.elements.is_exact else positions)
-        excess = (self._average.covariance_at(positions) - intact if any(self._scales)
+        excess = (self._average_at(positions) - intact if any(self._scales)
                   else np.zeros(1))
         states = []
         for scale, offset, information in zip(

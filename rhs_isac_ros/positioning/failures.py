@@ -30,7 +30,11 @@ from rhs_isac_ros.model.gaussian import energy_limit
 from rhs_isac_ros.model.los import frame_gains
 from rhs_isac_ros.model.multipath import measurement_correlation, multipath_covariance
 from rhs_isac_ros.model.surface import radiation_matrix
-from rhs_isac_ros.positioning.dispersed import DispersedLikelihood, LocatedStates
+from rhs_isac_ros.positioning.dispersed import (
+    DispersedLikelihood,
+    InterpolatedCovariance,
+    LocatedStates,
+)
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
 from rhs_isac_ros.positioning.likelihood import (
     Columns,
@@ -278,6 +282,7 @@ class FailedSurfaces:
         self.likelihood, self.effects = likelihood, FailureEffects.of(scenario, codebook)
         self.intact = MeasurementModel(
             dataclasses.replace(scenario, failed_element_share=0.0), codebook).prepare()
+        self._intact_at = InterpolatedCovariance.of(self.intact)
         # Covariance of the errors that all failures together cause on average.
         failing = dataclasses.replace(scenario, element_error_rms=0.0)
         self._error = DeclaredElements(failing).error_covariance(failing, codebook)
@@ -325,7 +330,7 @@ class FailedSurfaces:
 
     def factors_at(self, failed: Failed, positions: np.ndarray) -> Factors:
         """Return factors of the covariance with the element errors at positions."""
-        excess = self.intact.covariance_at(positions) - self.surface(()).covariance
+        excess = self._intact_at(positions) - self.surface(()).covariance
         return Factors.of(
             self.likelihood.nuisance, self.surface(failed).covariance + excess)
 

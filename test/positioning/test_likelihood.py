@@ -8,9 +8,10 @@ from scipy.special import logsumexp
 from scipy.stats import binom
 
 from rhs_isac_ros.model import MeasurementModel, Scenario
+from rhs_isac_ros.model.elements import ElementErrors
 from rhs_isac_ros.model.geometry import to_polar, to_positions
 from rhs_isac_ros.model.impairments import nuisance_of
-from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
+from rhs_isac_ros.positioning.dispersed import DispersedLikelihood, InterpolatedCovariance
 from rhs_isac_ros.positioning.failures import FailureModel
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.offsets import Alignment
@@ -154,6 +155,31 @@ def test_errors_of_elements_have_the_covariance_at_the_position(codebook):
         assert local.residual[n] == pytest.approx(energy, rel=1e-6)
         value = average - energy - np.sum(np.linalg.slogdet(covariance)[1])
         assert local.value[n] == pytest.approx(value, rel=1e-6)
+
+
+@pytest.mark.parametrize('changes', [
+    {}, {'failed_element_share': 0.05}, {'roi_size_m': (2, 0, 0)},
+    {'user_gain': lambda angles: np.cos(angles)**2}],
+    ids=['errors', 'errors and failures', 'line', 'gain pattern'])
+def test_the_covariance_at_the_position_is_interpolated(codebook, changes):
+    """The stated error is that of whitened covariances. Beyond the region, nothing grows."""
+    model = MeasurementModel(declaring(element_error_rms=0.1, **changes), codebook)
+    positions = model.scenario.sample_positions(50, np.random.default_rng(5))
+    covariance_at = InterpolatedCovariance.of(model)
+    assert isinstance(covariance_at, InterpolatedCovariance)
+    errors = model.whitener @ (covariance_at(positions) - model.covariance_at(positions)
+                               ) @ np.conj(np.swapaxes(model.whitener, 1, 2))
+    assert np.linalg.norm(errors, axis=(2, 3)).max() < 2e-5
+    beyond = 2 * positions
+    np.testing.assert_allclose(
+        np.trace(covariance_at(beyond), axis1=2, axis2=3),
+        np.trace(model.covariance_at(beyond), axis1=2, axis2=3), rtol=0.03)
+
+
+def test_covariances_of_an_estimated_surface_are_not_interpolated(codebook):
+    surface = ElementErrors(np.ones(36), np.full(36, np.nan))
+    model = MeasurementModel(SCENARIO, codebook, surface)
+    assert InterpolatedCovariance.of(model) == model.covariance_at
 
 
 def test_the_likelihood_is_the_average_over_the_number_of_failures(codebook):
