@@ -369,18 +369,12 @@ def test_the_user_moves_during_a_cycle(scenario, codebooks, pose):
         assert not np.isclose(moving, signals(band, start, np.zeros(3))).any()
 
 
-def test_a_user_who_walks_behind_the_surface_has_no_signals(scenario):
-    channel = Channel(dataclasses.replace(scenario, frame_duration_s=0.1), 0)
-    behind = m.GroundTruth(cycle_id=3, user=1, position=np.array([0.1, 0.0, 0.0]),
-                           velocity=np.array([1.0, 0.0, 0.0]))
-    assert feed(channel, [behind, configured(3, np.ones((2, 16))), pilots_of(3)]) == [[], [], []]
-    assert channel.counters == {'behind': 1}
-
-
-def test_a_user_behind_the_surface_has_no_signals(scenario):
+@pytest.mark.parametrize(('place', 'speed_mps'), [(-1.0, 0.0), (0.1, 1.0)])
+def test_a_user_who_is_or_walks_behind_the_surface_has_no_signals(scenario, place, speed_mps):
     """Another surface of the site may have the user in sight."""
-    channel = Channel(scenario, 0)
-    behind = truth_of(3, place=np.array([-1.0, 0.0, 0.0]))
+    channel = Channel(dataclasses.replace(scenario, frame_duration_s=0.1), 0)
+    behind = m.GroundTruth(cycle_id=3, user=1, position=np.array([place, 0.0, 0.0]),
+                           velocity=np.array([speed_mps, 0.0, 0.0]))
     assert feed(channel, [behind, configured(3, np.ones((2, 16))), pilots_of(3)]) == [[], [], []]
     assert channel.counters == {'behind': 1}
 
