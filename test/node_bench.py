@@ -1,7 +1,6 @@
 """Nodes in the process of a test, which spins them itself in the domain of `node_processes`."""
 
 import contextlib
-import dataclasses
 import gc
 import importlib
 import sys
@@ -11,7 +10,6 @@ import warnings
 import numpy as np
 import pytest
 import rclpy
-import yaml
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import SingleThreadedExecutor
@@ -149,10 +147,12 @@ def probe(bench):
 def bench_files(small, random_beams, tmp_path_factory):
     """Folder with the files of a small scenario and of two codebooks for it."""
     folder = tmp_path_factory.mktemp('small')
-    fields = {key: list(value) if isinstance(value, tuple) else value
-              for key, value in dataclasses.asdict(small.scenario).items()}
-    (folder / 'scenario.yaml').write_text(yaml.safe_dump(fields), encoding='utf-8')
-    for seed, name in enumerate(('first', 'second')):
-        codebook = random_beams(small.scenario, np.random.default_rng(seed))
-        codebook.save(folder / f'{name}.yaml')
+    write_files(folder, small.scenario, random_beams)
     return folder
+
+
+def write_files(folder, scenario, random_beams):
+    """Write the files of a scenario and of two codebooks for it."""
+    scenario.to_yaml(folder / 'scenario.yaml')
+    for seed, name in enumerate(('first', 'second')):
+        random_beams(scenario, np.random.default_rng(seed)).save(folder / f'{name}.yaml')

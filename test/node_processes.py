@@ -9,12 +9,10 @@ import subprocess
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
-import yaml
 from ament_index_python.packages import get_package_prefix
 from forked import Forked
-from node_bench import TIMEOUT_S, Bench
+from node_bench import TIMEOUT_S, Bench, write_files
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
@@ -271,12 +269,9 @@ def small_files(random_beams, tmp_path_factory):
     """Folder with the files of a small scenario and of two codebooks for it."""
     folder = tmp_path_factory.mktemp('small')
     # Twelve measurements rarely show whether a user is inside: all users are taken to be.
-    fields = {'n_subbands': 2, 'n_frames': 3, 'n_feeds': 2, 'elements_per_side': 4,
-              'outside_probability': 0.0}
-    scenario = Scenario(**fields)
-    (folder / 'scenario.yaml').write_text(yaml.safe_dump(fields), encoding='utf-8')
-    for seed, name in enumerate(('first', 'second')):
-        random_beams(scenario, np.random.default_rng(seed)).save(folder / f'{name}.yaml')
+    write_files(folder, Scenario(
+        n_subbands=2, n_frames=3, n_feeds=2, elements_per_side=4, outside_probability=0.0),
+        random_beams)
     return folder
 
 
