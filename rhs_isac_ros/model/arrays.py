@@ -201,9 +201,7 @@ def checked_states(states: ArrayLike) -> np.ndarray:
 
     Raises ValueError as `checked_positions`, and if a velocity is not finite.
     """
-    array = numbers('positions', states, shapes=[('N', 3), ('N', 6)])
-    checked_positions(array[:, :3])
-    return array
+    return _checked('positions', states, ('N', 3), ('N', 6))
 
 
 def checked_bounds(bounds_m: ArrayLike) -> np.ndarray:
@@ -230,9 +228,9 @@ def checked_position(position: ArrayLike, name: str = 'position') -> np.ndarray:
     return _checked(name, position, (3,))
 
 
-def _checked(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> np.ndarray:
-    array = numbers(name, value, shapes=[shape])
-    if problem := position_problem(array):
+def _checked(name: str, value: ArrayLike, *shapes: tuple[int | str, ...]) -> np.ndarray:
+    array = numbers(name, value, shapes=shapes)
+    if problem := position_problem(array[..., :3]):
         raise ValueError(f'{name}: {problem}')
     return array
 

@@ -254,9 +254,13 @@ class NuisancePrior(Exponents):
 
     def log_evidence_of_aligned(self, aligned: np.ndarray) -> np.ndarray:
         """Return the log of Laplace's integral over the parameters [..., Q] of `Alignment`."""
-        volume = np.linalg.slogdet(self.axes[:, self.moves_multipath])[1]
-        found: np.ndarray = volume - aligned**2 @ self.precision / 2
+        found: np.ndarray = self._log_volume - aligned**2 @ self.precision / 2
         return found
+
+    @functools.cached_property
+    def _log_volume(self) -> float:
+        """Logarithm of the volume that `axes` span."""
+        return float(np.linalg.slogdet(self.axes[:, self.moves_multipath])[1])
 
     @functools.cached_property
     def axes(self) -> np.ndarray:
