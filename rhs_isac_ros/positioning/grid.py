@@ -294,11 +294,13 @@ class TemplateTable:
         decrease = ((cells.range_m[peaks.cell] / range_m)**2)[:, None]
         gradient -= decrease * cells.energy_slope[peaks.cell]
         step = np.einsum('pij,pj->pi', cells.inverse[peaks.cell], gradient) / decrease
-        most = query.explained_at_most(peaks.shots, peaks.gain)
-        change = (np.minimum(exact + np.sum(gradient * step, axis=1) / 2, most)
-                  - np.minimum(approximate, most))
         limits = self._resolution.step_limits(query.prior.is_coarse)
-        return np.minimum(np.maximum(step, -limits), limits), peaks.value + change
+        step = np.minimum(np.maximum(step, -limits), limits)
+        rise = np.sum(gradient * step, axis=1) - decrease[:, 0] * likelihood_loss(
+            step, cells.curvature[peaks.cell])
+        most = query.explained_at_most(peaks.shots, peaks.gain)
+        change = np.minimum(exact + rise, most) - np.minimum(approximate, most)
+        return step, peaks.value + change
 
     def _outputs(self, query: Query, peaks: Peaks, range_m: np.ndarray
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -44,6 +44,8 @@ _COARSE = 3
 _GAIN = 0.05
 # Share of the latest step by which the next one turns back, above which it is shortened.
 _TURN = 0.5
+# Parts of the longest step along a line, of which the best one is taken.
+_PARTS = 1.0, 0.25, 0.0625, 0.0
 # Log-likelihood per u and v by which modes are ordered that are equal up to rounding, as those of
 # a surface whose halves mirror each other. Otherwise, the processor would choose one.
 _PREFERENCE = 1e-6 * np.array([0.0, 1.0, 0.6])
@@ -414,9 +416,27 @@ def _inside(points: np.ndarray, marginal: Marginal, step: np.ndarray, likelihood
         starts = points[outside]
         best = Inside.of(
             starts, marginal.gradient[outside], marginal.information[outside], bounds).nearest()
-        limited = starts + np.clip(to_polar(best) - starts, -limits, limits)
-        step[outside] = to_polar(np.clip(to_positions(limited), *bounds)) - starts
+        step[outside] = _best_towards(starts, best, limits, bounds, select(marginal, outside))
     return step
+
+
+def _best_towards(starts: np.ndarray, best: np.ndarray, limits: np.ndarray, bounds: np.ndarray,
+                  marginal: Marginal) -> np.ndarray:
+    """Return the most likely limited steps from points [M, 3] towards positions in the region.
+
+    A position within the limits of each coordinate may be unlikely, as these change together. On
+    the line to a position, the range has a minimum, so that only short steps may be better.
+    """
+    here, whole = to_positions(starts), to_polar(best) - starts
+    shares = np.minimum(1.0, np.min(limits / np.maximum(
+        np.abs(whole), np.finfo(float).tiny), axis=1))
+    ends = [to_positions(starts + np.clip(whole, -limits, limits)),
+            *(here + (shares * part)[:, None] * (best - here) for part in _PARTS)]
+    steps = to_polar(np.clip(ends, *bounds)) - starts
+    gains = [np.einsum('mp,mp->m', marginal.gradient, one)
+             - likelihood_loss(one, marginal.information) for one in steps]
+    chosen: np.ndarray = steps[np.argmax(gains, axis=0), np.arange(len(starts))]
+    return chosen
 
 
 def predict(local: Local, likelihood: Likelihood) -> np.ndarray:
@@ -451,7 +471,7 @@ def _prune(likelihood: Likelihood, modes: Modes, gain: np.ndarray, margin: float
     """
     # The likelihood of a mode is a prediction, and may be arbitrarily wrong before convergence.
     # The likelihood before the last step is known, and its maximum limits the best prediction.
-    value = modes.log_likelihood + np.maximum(gain, 0)
+    value = modes.log_likelihood + np.abs(gain)
     has_changed = np.zeros(modes.shots[-1] + 1, bool)
     has_changed[changed] = True
     order, chosen = modes.order, has_changed[modes.shots]

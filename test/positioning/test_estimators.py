@@ -9,6 +9,7 @@ from scipy.special import chdtri
 from scipy.stats import qmc
 
 from rhs_isac_ros.bounds.fisher import fisher_information
+from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario, ScenarioError, simulate_received
 from rhs_isac_ros.model.multipath import multipath_covariance
 from rhs_isac_ros.positioning import Tracker, make_estimator
@@ -351,6 +352,22 @@ def test_few_and_strong_measurements_locate_users(random_beams):
     assert estimate.fix.mean() > 0.97
     squares = squared_normalised(estimate.mean - positions, estimate.covariance)[estimate.fix]
     assert np.mean(squares < chdtri(3, 0.05)) > 0.88
+
+
+def test_one_frame_of_one_band_leaves_all_positions_on_a_surface():
+    """Of thousands of peaks, those count whose steps are predicted as far as they are taken."""
+    scenario = Scenario(
+        center_frequencies_hz=(49.8e9,), n_subbands=32, subband_width_hz=54.6e3, n_frames=1,
+        elements_per_side=(5, 16), element_interval_wavelengths=0.59, refractive_index=1.45,
+        delay_spread_s=22e-9, angular_spread_deg=4.4, multipath_to_los_db=-18.8,
+        max_power_w=0.0026, roi_center_m=(3.3, 1.3, -0.1), roi_size_m=(2.8, 2.7, 0.43))
+    codebook, rng = random_codebook(scenario, np.random.default_rng(8)), np.random.default_rng(8)
+    positions = scenario.sample_positions(40, rng)
+    estimate = make_estimator('bayes', scenario, codebook).estimate(
+        simulate_received(scenario, codebook, positions, rng))
+    squares = squared_normalised(estimate.mean - positions, estimate.covariance)
+    assert np.mean(squares < chdtri(3, 0.05)) > 0.9
+    assert np.mean(squares) < 1.6 * 3
 
 
 def test_regions_contain_the_range_within_a_wavelength(shipped):

@@ -15,7 +15,7 @@ from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
 from rhs_isac_ros.positioning.grid import Starts, TemplateTable
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.offsets import Alignment
-from rhs_isac_ros.positioning.search import ascend, expanded_at, find_modes, marginal_at
+from rhs_isac_ros.positioning.search import ascend, expanded_at, find_modes, marginal_at, one_step
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.positioning.templates import tabulate
 from rhs_isac_ros.system import System
@@ -236,6 +236,19 @@ def test_a_step_predicts_the_likelihood_after_it(codebook):
     first, *_, last = (float(modes.log_likelihood[0]) for modes in found)
     assert first == pytest.approx(last, abs=0.5)
     np.testing.assert_allclose(found[3].points, found[2].points, atol=1e-4)
+
+
+@pytest.mark.parametrize('size_m', [(0, 2, 1), (2, 0, 1), (0, 2, 0), (2, 2, 1)])
+def test_no_step_lowers_the_predicted_likelihood(codebook, size_m):
+    """On a plane, range and direction change together: limits of each would turn a step."""
+    scenario = dataclasses.replace(SCENARIO, roi_size_m=size_m, multipath_to_los_db=-20.0)
+    likelihood, rng = Likelihood(System(scenario, codebook)), np.random.default_rng(1)
+    signals = likelihood.signals(likelihood.model.sample(
+        scenario.sample_positions(200, rng), rng))
+    starts = Starts(np.arange(200), to_polar(scenario.sample_positions(200, rng)),
+                    np.zeros((200, 0)))
+    _, gain = one_step(likelihood, likelihood, starts, signals)
+    assert gain.min() >= 0 and np.median(gain) > 100
 
 
 @pytest.mark.parametrize('size_m', [(0, 0, 3), (0, 4, 0)], ids=['upright', 'across'])
