@@ -17,7 +17,7 @@ import copy
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -85,24 +85,17 @@ _PLACES = 24
 _CELLS = 256
 _SHEETS = 32
 _APART = 3.0
-
-
-class _Offsets(NamedTuple):
-    """How evidences are integrated over the parameters that move the multipath."""
-
-    # Number of steps to the maximum, largest step in standard deviations, and least curvature,
-    # relative to that of the multipath.
-    steps: int = 2
-    reach: float = 2.0
-    curvature: float = 0.5
-    # Absolute log odds of an alternative up to which its evidence may count, before and after the
-    # first step, and a step after which the curvature hardly changes.
-    near: float = 30.0
-    sure: float = 12.0
-    close: float = 0.7
-
-
-_OFFSETS = _Offsets()
+# Integrals of evidences over the parameters that move the multipath: number of steps to the
+# maximum, largest step in standard deviations, and least curvature, relative to that of the
+# multipath.
+_STEPS = 2
+_REACH = 2.0
+_CURVATURE = 0.5
+# Absolute log odds of an alternative up to which its evidence may count, before and after the
+# first step, and a step after which the curvature hardly changes.
+_NEAR = 30.0
+_SURE = 12.0
+_CLOSE = 0.7
 
 
 class Blocked:
@@ -465,24 +458,24 @@ def log_ratios_of(
             likelihood.whitened(values, select(signals, rows)), values, prior) - in_sight[rows]
 
     found, log_volume = ratios(values), np.zeros(len(values))
-    (near,) = np.nonzero(np.abs(alternative.log_odds + found) < _OFFSETS.near)
+    (near,) = np.nonzero(np.abs(alternative.log_odds + found) < _NEAR)
     around = np.concatenate([-axes, axes])
-    for _ in range(_OFFSETS.steps):
+    for _ in range(_STEPS):
         if not len(near):
             break
         best, at = found[near], values[near]
         low, high = np.split(ratios(
             (at[:, None] + around).reshape(-1, len(prior)), np.repeat(near, len(around))
         ).reshape(len(near), -1), 2, axis=1)
-        curvature = np.maximum(2 * best[:, None] - high - low, _OFFSETS.curvature)
+        curvature = np.maximum(2 * best[:, None] - high - low, _CURVATURE)
         log_volume[near] = -np.log(curvature).sum(axis=1) / 2
-        step = np.clip((high - low) / (2 * curvature), -_OFFSETS.reach, _OFFSETS.reach)
+        step = np.clip((high - low) / (2 * curvature), -_REACH, _REACH)
         moved = at + step @ axes
         there = ratios(moved, near)
         better = there > best
         found[near[better]], values[near[better]] = there[better], moved[better]
-        near = near[(np.abs(step).max(axis=1) >= _OFFSETS.close)
-                    & (alternative.log_odds + found[near] > -_OFFSETS.sure)]
+        near = near[(np.abs(step).max(axis=1) >= _CLOSE)
+                    & (alternative.log_odds + found[near] > -_SURE)]
     found += log_volume
     return found, values, likelihood.whitened(values, signals)
 
