@@ -204,8 +204,7 @@ class _Pairs(NamedTuple):
         columns = []
         for one, two in zip(reference, other, strict=True):
             here, there = _candidates(one), _candidates(two)
-            first, second = np.divmod(
-                np.arange(len(here.means) * len(there.means)), len(there.means))
+            first, second = np.indices((len(here.means), len(there.means))).reshape(2, -1)
             columns.append((
                 here.log_weights[first] + there.log_weights[second]
                 + np.log1p(-one.missing) + np.log1p(-two.missing),

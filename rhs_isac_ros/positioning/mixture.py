@@ -271,8 +271,7 @@ class Mixture(_Arrays):
         The other mixture may have fewer coordinates, which are the first ones of this mixture; it
         then is a likelihood of these. The mass is the integral of the product.
         """
-        first, second = np.divmod(
-            np.arange(len(self.means) * len(other.means)), len(other.means))
+        first, second = np.indices((len(self.means), len(other.means))).reshape(2, -1)
         return select(self, first).updated(select(other, second))
 
     def heaviest_pairs(self, other: 'Mixture', number: int, margin: float = np.inf
