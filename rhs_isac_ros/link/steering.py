@@ -1,6 +1,7 @@
 """Steering: the beam with the highest capacity at a position, and the choice of its band."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -240,7 +241,16 @@ def capacity_report(
     def actual_bps(beam: Beamformer) -> float:
         return float(actual_capacity(scenario, applied_beam(beam, surface), position[None])[0])
 
-    perfect = choose_beam(scenario, position, bands=bands, surface=surface)
+    perfect = _perfect(scenario, tuple(position.tolist()),
+                       None if bands is None else tuple(bands), surface)
     return CapacityReport(
         actual_bps(beam),
         actual_bps(perfect.beam) if scenario.channel else perfect.expected_bps)
+
+
+# Users at rest have the same position in each cycle.
+@functools.lru_cache(maxsize=64)
+def _perfect(scenario: Scenario, position: tuple[float, ...], bands: tuple[int, ...] | None,
+             surface: SurfaceEstimate | None) -> Choice:
+    """Return the beam for a position that is known exactly."""
+    return choose_beam(scenario, np.array(position), bands=bands, surface=surface)

@@ -19,6 +19,7 @@ from rhs_isac_ros.link import (
     expected_capacities,
     prepare_steering,
     steer,
+    steering,
 )
 from rhs_isac_ros.link.steering import steer_bands
 from rhs_isac_ros.model import Scenario
@@ -210,3 +211,16 @@ def test_a_report_is_about_the_calibrated_surface(table1, damaged):
     report = capacity_report(scenario, choice.beam, POSITION, surface=damaged)
     assert report.actual_bps == report.perfect_bps == choice.expected_bps
     assert capacity_report(scenario, choice.beam, POSITION).actual_bps != report.actual_bps
+
+
+def test_the_best_beam_of_a_user_at_rest_is_found_once(monkeypatch):
+    """The report of each cycle compares with the same beam."""
+    calls = []
+    monkeypatch.setattr(steering, 'choose_beam', lambda *args, **options: (
+        calls.append(args[1].tolist()), choose_beam(*args, **options))[1])
+    scenario = Scenario(element_gain=2.0)
+    beam = steer(scenario, POSITION)
+    first, again, moved = (capacity_report(scenario, beam, place, [0]) for place in (
+        POSITION, POSITION, POSITION + 0.1))
+    assert calls == [POSITION.tolist(), (POSITION + 0.1).tolist()]
+    assert first == again != moved
