@@ -12,8 +12,12 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import checked_position, read_only
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.elements import SurfaceEstimate
-from rhs_isac_ros.model.geometry import element_positions, feed_positions
-from rhs_isac_ros.model.los import los_gain
+from rhs_isac_ros.model.geometry import (
+    element_positions,
+    feed_positions,
+    subband_frequencies_hz,
+)
+from rhs_isac_ros.model.los import los_waves
 from rhs_isac_ros.model.multipath import SpatialCovariance, spatial_covariance
 from rhs_isac_ros.model.surface import NOMINAL, onboard_matrix, ports_of
 
@@ -136,7 +140,8 @@ class BandLink(Link):
         """
         onboard, slope, offset = arrays(scenario, surface)
         place, index = checked_position(position)[None], band_index(bands)
-        los = np.concatenate([los_gain(scenario, place, band) for band in bands])
+        waves, _, _ = los_waves(scenario, place, bands, slopes=False)
+        los = waves[:, :, 0] / subband_frequencies_hz(scenario)[index, :, None]
         return cls(onboard=onboard[index], los=los, spatial=spatial_covariance(scenario)[index],
                    noise_power_w=scenario.noise_power_w, power_w=scenario.max_power_w,
                    slope=slope[index], offset=offset[index])
