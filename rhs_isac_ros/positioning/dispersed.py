@@ -37,6 +37,8 @@ _MIN_ERROR_SHARE = 0.05
 _POWERS = 2, 3, 5
 _MAX_ERROR, _N_TESTS = 1e-5, 16
 _POINT_BYTES = 1 << 26
+# Width of the border of the region, because positions are rounded [m].
+_BORDER_M = 1e-6
 
 
 class InterpolatedCovariance:
@@ -49,14 +51,14 @@ class InterpolatedCovariance:
     """
 
     def __init__(self, model: MeasurementModel, power: int) -> None:
-        scenario = self._scenario = model.scenario
+        self._model, scenario = model, model.scenario
         self._constant = model.covariance_in_shadow()
         self._powers = np.array([
             powers for powers in itertools.product(range(power + 1), repeat=3)
             if powers[1] + powers[2] <= power])
         self._middle = [int(np.argmin(np.sum(element_positions(scenario)**2, axis=1)))]
-        low, high = scenario.roi_bounds_m
-        self._limits = np.sort(_smooth(polar_bounds(scenario.roi_bounds_m)), axis=0)
+        low, high = self._bounds_m = scenario.roi_bounds_m
+        self._limits = np.sort(_smooth(polar_bounds(self._bounds_m)), axis=0)
         n = 2 * len(self._powers)
         places = low + (high - low) * streams.unit_points()[:n + _N_TESTS]
         exact, gains = model.covariance_at(places), self._gains(places[:n])
@@ -79,20 +81,26 @@ class InterpolatedCovariance:
         return model.covariance_at
 
     def __call__(self, positions: np.ndarray) -> np.ndarray:
-        """Return covariances at positions [M, 3] [m], complex128 [M, N_B, N_SB F, N_SB F]."""
+        """Return covariances at positions [M, 3] [m], complex128 [M, N_B, N_SB F, N_SB F].
+
+        Those beyond the region are exact.
+        """
         found = (self._polynomials(positions) @ self._coefficients).view(complex).reshape(
             len(positions), *self._constant.shape)
         gains = self._gains(positions)
         found *= gains[..., None]
         found *= gains.conj()[:, :, None]
         found += self._constant
+        low, high = self._bounds_m
+        beyond = np.any((positions < low - _BORDER_M) | (positions > high + _BORDER_M), axis=1)
+        if beyond.any():
+            found[beyond] = self._model.covariance_at(positions[beyond])
         return found
 
     def _polynomials(self, positions: np.ndarray) -> np.ndarray:
         """Return products of powers at positions [M, 3], float64 [M, K]."""
-        # Beyond the region, high powers would grow.
         low, high = self._limits
-        scaled = (2 * np.clip(_smooth(to_polar(positions)), low, high) - low - high) / np.where(
+        scaled = (2 * _smooth(to_polar(positions)) - low - high) / np.where(
             high > low, high - low, 1.0)
         values = scaled[:, :, None]**np.arange(self._powers.max() + 1)
         products: np.ndarray = np.prod(
@@ -101,9 +109,10 @@ class InterpolatedCovariance:
 
     def _gains(self, positions: np.ndarray) -> np.ndarray:
         """Return gains of an element in the middle, in any unit, complex128 [M, N_B, N_SB F]."""
+        scenario = self._model.scenario
         waves, _, _ = los_waves(
-            self._scenario, positions, range(self._scenario.n_bands), self._middle, slopes=False)
-        return np.moveaxis(waves[..., 0], 2, 0).repeat(self._scenario.n_frames, axis=2)
+            scenario, positions, range(scenario.n_bands), self._middle, slopes=False)
+        return np.moveaxis(waves[..., 0], 2, 0).repeat(scenario.n_frames, axis=2)
 
 
 def _smooth(points: np.ndarray) -> np.ndarray:
