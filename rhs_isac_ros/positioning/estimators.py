@@ -45,16 +45,15 @@ from rhs_isac_ros.positioning.posterior import (
     draw_broad_samples,
     draw_samples,
 )
-from rhs_isac_ros.positioning.scope import SearchScope
+from rhs_isac_ros.positioning.scope import ModeSearch, SearchScope
 from rhs_isac_ros.positioning.search import (
     EXACT_MARGIN,
     GRID_MARGIN,
     Modes,
     OneState,
     likely_modes,
-    modes_from,
 )
-from rhs_isac_ros.positioning.segments import Segments, concatenate, select
+from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.positioning.templates import N_NORMAL, standard_normal, tabulate
@@ -77,8 +76,6 @@ _CLEAR = -3.0
 # Number of modes of the average over surfaces, which only shows whether there is a doubt. The
 # others contain 1 % of its evidence.
 _AVERAGED = 32
-# Growth of errors on the grid, see `NuisancePrior.growth`, above which it is searched again.
-_NOISIER = 8.0
 
 
 class SearchEstimator(abc.ABC):
@@ -364,33 +361,10 @@ class SearchEstimator(abc.ABC):
             scope.drawn if draws else None)
         fits = {shot: _Searched(fit) for shot, fit in drawn.items()}
         if len(starts.shots):
-            modes = self._in_noise(scope, modes_from(
-                starts, self._likelihood, signals, aligned, float(margin.max()),
-                self._refinement.is_exact), signals, aligned, whitened, margin)
-            fits.update(self._fits_of(scope, modes, signals))
+            search = ModeSearch(
+                scope, self._likelihood, signals, margin, self._refinement.is_exact)
+            fits.update(self._fits_of(scope, search.modes(starts, aligned, whitened), signals))
         return [fits[shot] for shot in range(len(aligned))]
-
-    def _in_noise(self, scope: SearchScope, modes: Modes, signals: Signals, aligned: np.ndarray,
-                  whitened: np.ndarray, margin: np.ndarray) -> Modes:
-        """Search again, with a wider margin, for the modes of shots with a low gain."""
-        prior = self._likelihood.nuisance
-        if not prior.has_gain:
-            return modes
-        best = Segments.of_keys(modes.shots)
-        growth = prior.growth(best.first(modes.values) @ prior.gain)
-        parts = [modes]
-        # The margin of users who move does not depend on the scope.
-        for place in np.flatnonzero((growth > _NOISIER) & (not prior.velocity.size)):
-            shot = int(modes.shots[best.starts[place]])
-            starts = scope.table.starts(
-                whitened[[shot]], prior,
-                growth[place] * GRID_MARGIN + scope.alignment.margin + margin)
-            parts[0] = select(parts[0], parts[0].shots != shot)
-            parts.append(modes_from(
-                starts._replace(shots=starts.shots + shot), self._likelihood, signals, aligned,
-                float(margin.max()), self._refinement.is_exact))
-        modes = concatenate(*parts)
-        return select(modes, np.argsort(modes.shots, kind='stable'))
 
     def _fits_of(self, scope: SearchScope, modes: Modes, signals: Signals
                  ) -> Iterator[tuple[int, '_Searched']]:

@@ -15,9 +15,10 @@ _POINTS_PER_TURN = 6  # Of the phase between two measurements, if these are more
 _BLOCK = 1 << 20  # Number of complex numbers at a time.
 _REFINEMENTS = 4  # Of the best point.
 # Errors of the estimates, in standard deviations, whose effect the margin covers, and largest
-# margin. Nearby users have stronger signals than the average, on which the effect depends.
-_DEVIATION = 6.0
+# margin. Where errors at the best mode cost more than a share of it, the search is repeated.
+_DEVIATION = 4.0
 _MARGIN = 200.0
+_SHARE = 0.5
 # Smallest eigenvalue of a sum of signals, as a share of its trace.
 _MIN_SPREAD = 1e-12
 
@@ -28,7 +29,7 @@ class Alignment:
     Offsets of carrier and timing move the multipath out of the nulls of its covariance, so they
     must be known before the search. `spread`, from `tabulate`, contains the second moments of the
     whitened means over the region, and accounts for the unknown position. `margin` is the loss of
-    log-likelihood that errors of the estimates may cause at the true position.
+    log-likelihood that usual errors of the estimates cause at the true position.
     """
 
     def __init__(self, likelihood: Likelihood, spread: np.ndarray) -> None:
@@ -42,9 +43,23 @@ class Alignment:
         moves = np.ix_(*2 * [self._prior.moves_multipath])
         known = self._prior.information_of(likelihood.model.root @ roots, self._whitener)
         precision = (known + np.diag(self._prior.precision))[moves]
-        loss = np.trace(np.linalg.solve(
-            precision, self._prior.direct_information(spread)[moves])) / 2
+        # Information in the direct path of an average user, per energy of the whitened mean.
+        self._information = self._prior.direct_information(spread)
+        loss = np.trace(np.linalg.solve(precision, self._information[moves])) / 2
         self.margin = min(_DEVIATION**2 * float(loss), _MARGIN)
+        self._information /= max(
+            float(np.trace(spread, axis1=1, axis2=2).real.sum()), np.finfo(float).tiny)
+
+    def is_wrong(self, errors: np.ndarray, energies: np.ndarray) -> np.ndarray:
+        """Return whether errors [N, Q] cost more than a part of the margin allows, bool [N].
+
+        `energies`, [N], are those of the whitened direct paths.
+        """
+        moves = self._prior.moves_multipath
+        information = self._information[np.ix_(moves, moves)]
+        squares = np.einsum('np,pq,nq->n', errors[:, moves], information, errors[:, moves])
+        wrong: np.ndarray = energies * squares / 2 > _SHARE * self.margin
+        return wrong
 
     def values_of_each(self, received: np.ndarray, starts: np.ndarray | None = None
                        ) -> np.ndarray:

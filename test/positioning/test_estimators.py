@@ -370,6 +370,24 @@ def test_one_frame_of_one_band_leaves_all_positions_on_a_surface():
     assert np.mean(squares) < 1.6 * 3
 
 
+def test_offsets_far_from_their_first_estimates_are_found_with_strong_signals():
+    """The direct path of a strong signal misleads the estimates before the search."""
+    scenario = Scenario(
+        center_frequencies_hz=(51.3e9,), n_subbands=16, subband_width_hz=289e3, n_frames=8,
+        elements_per_side=(8, 12), element_interval_wavelengths=0.41, n_feeds=2,
+        refractive_index=2.29, delay_spread_s=131e-9, angular_spread_deg=3.8,
+        multipath_to_los_db=-8.4, max_power_w=0.0155, roi_center_m=(17.5, -5.5, 1),
+        roi_size_m=(7.8, 21.4, 4.4), timing_std_s=13e-9)
+    codebook, rng = random_codebook(scenario, np.random.default_rng(0)), np.random.default_rng(0)
+    positions = scenario.sample_positions(60, rng)
+    received = simulate_received(scenario, codebook, positions, rng)
+    # Of these, the margin of the search covers too little.
+    far = [52, 53, 15]
+    estimate = make_estimator('bayes', scenario, codebook).estimate(received[far])
+    squares = squared_normalised(estimate.mean - positions[far], estimate.covariance)
+    assert (squares < 16).all()
+
+
 def test_regions_contain_the_range_within_a_wavelength(shipped):
     """With strong signals and partly known phases, most of the variance is within it."""
     scenario = Scenario(multipath_to_los_db=-40.0, band_phase_std_rad=1.0)

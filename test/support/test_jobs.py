@@ -371,7 +371,7 @@ def test_a_run_that_ends_as_a_job_is_sent_shows_no_traceback(monkeypatch):
     failed = []
     monkeypatch.setattr(threading, 'excepthook', failed.append)
     monkeypatch.setattr(jobs_module.queue, 'SimpleQueue', Queue)
-    for _ in range(5):
+    for _ in range(3):
         with pytest.raises(KeyboardInterrupt):
             run_jobs(lambda number, of: {'square': number**2}, JOBS, n_jobs=2)
     assert not failed
