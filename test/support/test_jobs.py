@@ -383,7 +383,11 @@ def test_ctrl_c_ends_all_processes_and_the_run_resumes(tmp_path):
         [sys.executable, '-c', INTERRUPTED, str(tmp_path)], capture_output=True, text=True,
         timeout=240, start_new_session=True, check=False)
     assert done.returncode == 130, done.stderr
-    assert done.stderr == 'interrupted: finished jobs are kept; repeat the command to resume\n'
+    # joblib 1.6.0: its tracker of semaphores may warn of one after the end of the program.
+    first, *others = done.stderr.splitlines()
+    assert first == 'interrupted: finished jobs are kept; repeat the command to resume'
+    assert not [line for line in others if not line.startswith('  warnings.warn(')
+                and 'UserWarning: resource_tracker: ' not in line]
     jobs = [Job(str(number), {'number': number}) for number in range(4)]
     results = run_jobs(lambda number: {'number': number}, jobs, tmp_path, n_jobs=1)
     assert [result['number'] for result in results] == [0, 1, 2, 3]
