@@ -237,6 +237,7 @@ class Workers:
             import joblib  # noqa: F401 - its absence is reported by name
             from joblib.externals import loky
 
+        _start_tracker()
         number = loky.cpu_count() if self.n_jobs < 0 else self.n_jobs
         executor = loky.ProcessPoolExecutor(
             number, initializer=_begin_process, initargs=(os.getpid(),), env=_ONE_THREAD)
@@ -440,6 +441,22 @@ def _begin_process(parent: int) -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=watch, daemon=True).start()
+
+
+def _start_tracker() -> None:
+    """Start the process of loky that removes semaphores, unless it runs, without its warnings.
+
+    After the end of a program that Ctrl-C has interrupted, it may warn of semaphores that it
+    removes, or that are already removed.
+    """
+    from joblib.externals.loky.backend import resource_tracker
+
+    before = sys.warnoptions[:]
+    sys.warnoptions.append('ignore:resource_tracker:UserWarning')
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        sys.warnoptions[:] = before
 
 
 def _await_calls(executor: Executor) -> None:
