@@ -40,6 +40,7 @@ class Draw(NamedTuple):
     # Computes the posterior of one shot of a query, or returns None if a search is better.
     fit: Callable[[Query, int], Fit | None]
 
+
 # Number of amplitudes in a block, one for each shot, cell and band, which limits the number of
 # shots in it.
 _BLOCK = 1 << 18
