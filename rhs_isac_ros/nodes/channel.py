@@ -4,10 +4,12 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
+from rclpy.impl.logging_severity import LoggingSeverity
+
 from rhs_isac_ros.frontend import Air, FrontEnd, Radio, SampleRecorder, make_radio, make_surface
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol.channel import Channel, apply_patterns
-from rhs_isac_ros.ros.endpoints import BackgroundWorker, surviving
+from rhs_isac_ros.ros.endpoints import BackgroundWorker, log, surviving
 from rhs_isac_ros.ros.parameters import calibrated_surface
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import entry
@@ -45,8 +47,7 @@ class ChannelNode(RoleNode[Channel]):
         self.start(Channel(
             self.scenario, values.seed, self.make_settings(values),
             calibrated_surface(values, self.surface, 'states_file')))
-        self.get_logger().info(  # type: ignore[no-untyped-call]
-            f'serving: {self.scenario.n_bands} bands, {self.scenario.n_elements} elements, '
+        log(self, f'serving: {self.scenario.n_bands} bands, {self.scenario.n_elements} elements, '
             f'surface {values.surface}, radio {values.radio}')
 
     def _make(self, kind: str, make: Callable[..., _Result], *arguments: Any) -> _Result:
@@ -59,10 +60,10 @@ class ChannelNode(RoleNode[Channel]):
     def _recorder(self, radio: Radio) -> SampleRecorder | None:
         if not self.values.samples_folder:
             return None
-        logger = self.get_logger()  # type: ignore[no-untyped-call]
         with translated(ValueError, ParameterError, 'samples_folder'):
             return SampleRecorder(
-                self.values.samples_folder, self.scenario, radio.modem, logger.error)
+                self.values.samples_folder, self.scenario, radio.modem,
+                functools.partial(log, self, severity=LoggingSeverity.ERROR))
 
     def execute(self, action: events.Action) -> None:
         """Show configurations, and measure them."""
@@ -87,8 +88,8 @@ class ChannelNode(RoleNode[Channel]):
         try:
             self._front_end.close()
         except Exception as error:
-            self.get_logger().warning(  # type: ignore[no-untyped-call]
-                f'surface or radio not released: {type(error).__name__}: {error}')
+            log(self, f'surface or radio not released: {type(error).__name__}: {error}',
+                LoggingSeverity.WARN)
 
 
 main = entry('channel', lambda: [ChannelNode()])

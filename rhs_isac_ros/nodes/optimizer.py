@@ -20,7 +20,7 @@ from rhs_isac_ros.codebook.optimize import INTERRUPTED
 from rhs_isac_ros.protocol import events
 from rhs_isac_ros.protocol.role import Role
 from rhs_isac_ros.ros import convert, parameters, topics
-from rhs_isac_ros.ros.endpoints import LATCHED, create_publisher
+from rhs_isac_ros.ros.endpoints import LATCHED, create_publisher, log
 from rhs_isac_ros.ros.parameters import CODEBOOK, CODEBOOK_PREFIX, same_value
 from rhs_isac_ros.ros.role_node import RoleNode
 from rhs_isac_ros.ros.run import StartError, parse, run, spin
@@ -177,8 +177,7 @@ class OptimizerNode(RoleNode[Holder]):
         self._publisher.publish(convert.to_bytes(
             convert.CodebookMessage.of(codebook, self.instance, self.scenario.id),
             self.get_clock().now().nanoseconds, frame=self.frame.surface))
-        self.get_logger().info(  # type: ignore[no-untyped-call]
-            f'codebook {codebook.id}: average CRLB {codebook.average_crlb_m2:.4f} m^2')
+        log(self, f'codebook {codebook.id}: average CRLB {codebook.average_crlb_m2:.4f} m^2')
 
 
 def main(args: Sequence[str] | None = None) -> int:

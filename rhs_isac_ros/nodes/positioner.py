@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from rclpy.impl.logging_severity import LoggingSeverity
 
 from rhs_isac_ros import positioning
 from rhs_isac_ros.codebook import Codebook
@@ -40,10 +41,10 @@ class PositionerNode(LocatingNode[Positioner]):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('positioner', **node_options)
         if text := movement_warning(self.scenario):
-            self.get_logger().warning(text)  # type: ignore[no-untyped-call]
+            endpoints.log(self, text, LoggingSeverity.WARN)
         settings = self.make_settings(self.values)
         if settings.reject_outside and (text := unrecognised_outside(self.scenario)):
-            self.get_logger().info(text)  # type: ignore[no-untyped-call]
+            endpoints.log(self, text)
         self._worker, self._table = endpoints.BackgroundWorker(self), ''
         self.endings.callback(self._worker.close)
         self.start(

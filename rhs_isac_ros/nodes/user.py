@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
+from rclpy.impl.logging_severity import LoggingSeverity
 from rclpy.node import Node
 from rclpy.time import Time
 
@@ -280,9 +281,10 @@ class UserNode(RoleNode[User]):
                 f'{name}: {given.tolist()}, expected points in front of the surface, x > 0')
         low, high = self.scenario.roi_bounds_m
         if not ((points >= low) & (points <= high)).all():
-            self.get_logger().warning(  # type: ignore[no-untyped-call]
-                f'{name}: {given.tolist()}: outside of the region of interest, {low.tolist()} to '
-                f'{high.tolist()} in the frame of the surface; a user there gets no position')
+            endpoints.log(
+                self, f'{name}: {given.tolist()}: outside of the region of interest, '
+                f'{low.tolist()} to {high.tolist()} in the frame of the surface; a user there '
+                'gets no position', LoggingSeverity.WARN)
         return points
 
     def publish(self, message: m.Message) -> bool:

@@ -189,8 +189,8 @@ class VisualizerNode(Node):
         endpoints.subscribe_messages(self, SCENE_RECEIVES, self._scenario, self._on_message,
                                      on_foreign=lambda message: None)
         endpoints.steady_timer(self, values.period_s, self._show)
-        self.get_logger().info(  # type: ignore[no-untyped-call]
-            'serving: markers, paths' + (
+        endpoints.log(
+            self, 'serving: markers, paths' + (
                 ' and transforms' if TFMessage
                 else '; no transforms, because tf2_msgs is not installed'))
 

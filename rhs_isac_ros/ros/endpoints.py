@@ -14,6 +14,7 @@ import copy
 import functools
 import inspect
 import itertools
+import sys
 import threading
 import time
 import weakref
@@ -24,6 +25,8 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.impl.logging_severity import LoggingSeverity
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -77,6 +80,18 @@ _CreatedT = TypeVar('_CreatedT')
 _refusals: weakref.WeakKeyDictionary[Node, dict[str, str]] = weakref.WeakKeyDictionary()
 
 
+def log(node: Node, text: str, severity: LoggingSeverity = LoggingSeverity.INFO) -> None:
+    """Log a line of a node, with the place of this call.
+
+    The methods of a logger examine all modules to find that place, which takes 40 ms of processor
+    time at the first line of a process.
+    """
+    caller = sys._getframe(1)
+    rclpy_implementation.rclpy_logging_rcutils_log(
+        severity, node.get_logger().name, text, caller.f_code.co_name, caller.f_code.co_filename,
+        caller.f_lineno)
+
+
 def refusals(node: Node) -> dict[str, str]:
     """Return descriptions of refused endpoints, by kind and name."""
     return _refusals.get(node, {})
@@ -94,7 +109,7 @@ def create_or_refuse(node: Node, what: str, create: Callable[[], _CreatedT]) -> 
         text = f'{what} was refused: {str(error).partition(", at ")[0].splitlines()[0]}'
         known = _refusals.setdefault(node, {})
         if what not in known:
-            node.get_logger().error(text)
+            log(node, text, LoggingSeverity.ERROR)
         known[what] = text
         return None
 
@@ -230,7 +245,7 @@ class Journal:
     """The log lines of a node about states and events, limited as `StateLog` describes."""
 
     def __init__(self, node: Node) -> None:
-        self._logger, self._log = node.get_logger(), StateLog()
+        self._node, self._log = node, StateLog()
         self._lock = threading.Lock()
         self._timer = steady_timer(node, _JOURNAL_S, lambda: self._write(StateLog.due))
 
@@ -259,14 +274,9 @@ class Journal:
                 self._timer.cancel()
             else:
                 set_period(self._timer, max(due_s - now_s, _JOURNAL_S))
-        # Three calls, because rclpy requires that a line of code always logs with one severity.
         for text, warning, error in lines:
-            if error:
-                self._logger.error(text)
-            elif warning:
-                self._logger.warning(text)
-            else:
-                self._logger.info(text)
+            log(self._node, text, LoggingSeverity.ERROR if error else
+                LoggingSeverity.WARN if warning else LoggingSeverity.INFO)
 
 
 _journals: weakref.WeakKeyDictionary[Node, Journal] = weakref.WeakKeyDictionary()

@@ -24,6 +24,7 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.impl.logging_severity import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
@@ -34,7 +35,7 @@ from rhs_isac_ros.model.elements import SurfaceEstimate
 from rhs_isac_ros.protocol.settings import BaseStationSettings
 from rhs_isac_ros.protocol.user_registry import MAX_USERS
 from rhs_isac_ros.ros import topics
-from rhs_isac_ros.ros.endpoints import create_or_refuse, refusals
+from rhs_isac_ros.ros.endpoints import create_or_refuse, log, refusals
 from rhs_isac_ros.ros.node_surface import NodeSurface
 from rhs_isac_ros.ros.roster import MEMBERS
 from rhs_isac_ros.support import plugins
@@ -298,7 +299,8 @@ def check_nodes(nodes: Sequence[Node]) -> None:
                    if not (name in known or node.has_parameter(name)
                            or name.startswith('qos_overrides.'))]
         if foreign:
-            node.get_logger().warning(f'unknown parameters are ignored: {", ".join(foreign)}')
+            log(node, f'unknown parameters are ignored: {", ".join(foreign)}',
+                LoggingSeverity.WARN)
 
 
 def known_names() -> set[str]:

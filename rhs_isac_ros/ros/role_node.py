@@ -388,7 +388,7 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             case events.LogMessage(text, True, key):
                 endpoints.journal(self).event(key or text, text)
             case events.LogMessage(text):
-                self.get_logger().info(text)  # type: ignore[no-untyped-call]
+                endpoints.log(self, text)
             case events.RevertSettings(settings):
                 self.revert_parameters(settings)
             case _:

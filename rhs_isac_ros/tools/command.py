@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.impl.logging_severity import LoggingSeverity
 from rclpy.node import Node
 
 import rhs_isac_msgs.msg as ros
@@ -125,9 +126,9 @@ def expecting_cycles(node: _NodeT, delay_s: float = 3.0) -> _NodeT:
     def examine() -> None:
         spaces = {space for name, space in node.get_node_names_and_namespaces() if name == 'bs'}
         if spaces and node.get_namespace() not in spaces:
-            node.get_logger().warning(  # type: ignore[no-untyped-call]
-                f'no base station in the namespace {node.get_namespace()}; select one with '
-                f'--ros-args -r __ns:=NAME: {", ".join(sorted(spaces))}')
+            endpoints.log(
+                node, f'no base station in the namespace {node.get_namespace()}; select one with '
+                f'--ros-args -r __ns:=NAME: {", ".join(sorted(spaces))}', LoggingSeverity.WARN)
     endpoints.once(node, delay_s, examine)
     return node
 
@@ -140,7 +141,7 @@ def subscribe_codebooks(
             codebook = convert.from_bytes(convert.CodebookMessage, content).codebook()
             codebook.check(scenario)
         except (m.MessageError, CodebookError) as error:
-            node.get_logger().warning(f'dropped codebook: {error}')
+            endpoints.log(node, f'dropped codebook: {error}', LoggingSeverity.WARN)
             return
         on_codebook(codebook)
     endpoints.subscribe(

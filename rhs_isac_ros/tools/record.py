@@ -5,6 +5,7 @@ import argparse
 from rclpy.node import Node
 
 from rhs_isac_ros.positioning import Site
+from rhs_isac_ros.ros.endpoints import log
 from rhs_isac_ros.ros.parameters import WITHOUT_SERVICES
 from rhs_isac_ros.ros.recording import Recorder
 from rhs_isac_ros.support.arguments import ArgumentParser, input_file, output_file
@@ -18,13 +19,12 @@ class RecorderNode(Node):
         super().__init__('recorder', **WITHOUT_SERVICES)
         self._topics: set[str] = set()
         recorder.record_topics(self, self._log_topic)
-        self._log = self.get_logger()  # type: ignore[no-untyped-call]
-        self._log.info('recording; press Ctrl-C to stop')
+        log(self, 'recording; press Ctrl-C to stop')
 
     def _log_topic(self, name: str) -> None:
         if name not in self._topics:
             self._topics.add(name)
-            self._log.info(f'first message of {name}')
+            log(self, f'first message of {name}')
 
 
 def _record(options: argparse.Namespace, arguments: list[str]) -> int:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from nav_msgs.msg import Odometry
+from rclpy.impl.logging_severity import LoggingSeverity
 from rclpy.node import Node
 
 from rhs_isac_ros.model import Scenario
@@ -85,7 +86,7 @@ class ViewNode(Node):
             self._warn(f'{self.silence}; still waiting')
 
     def _warn(self, text: str) -> None:
-        self.get_logger().warning(text)  # type: ignore[no-untyped-call]
+        endpoints.log(self, text, LoggingSeverity.WARN)
 
     def _on_message(self, message: m.Message, arrived_s: float) -> None:
         if isinstance(message, m.Beam):
