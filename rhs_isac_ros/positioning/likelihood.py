@@ -320,11 +320,9 @@ def assemble(prior: NuisancePrior, values: np.ndarray, columns: Columns,
         by_band = (len(values), *prior.gains.shape[:1], -1)
         squares = parts.reshape(len(parts), -1, 2)**2
         surplus = np.sum((shares * (1 - squares.sum(axis=2))).reshape(by_band), axis=2)
-        lost = np.sum((4 * (1 - shares)**2 - 4).reshape(by_band), axis=2)
-        gains = prior.gains * still
         value += 2 * np.log(weights).sum(axis=1)
         gradient[:, first:n] += 2 * surplus @ prior.gains
-        information[:, first:n, first:n] += np.einsum('bq,mb,bp->mqp', gains, lost, gains)
+        information[:, first:n, first:n] -= prior.hidden(shares)
     if not n_linear:
         return Local(value, gradient, information, energy)
     marginal = marginalise(information, gradient, n)

@@ -339,6 +339,17 @@ class NuisancePrior(Exponents):
         total = 1 + noise * (power - 1)
         return 1 / np.sqrt(total), noise * power / total
 
+    def hidden(self, shares: np.ndarray) -> np.ndarray:
+        """Return the part of `information` that thermal noise hides, [M, Q, Q].
+
+        A gain does not scale the noise, whose shares of the measurements are those of
+        `noise_weights`.
+        """
+        lost = np.sum((4 - 4 * (1 - shares)**2).reshape(len(shares), len(self.gains), -1), axis=2)
+        gains = self.gains * ~self.moves_multipath
+        found: np.ndarray = np.einsum('bq,mb,bp->mqp', gains, lost, gains)
+        return found
+
 
 def _relative_std(phase_covariance: np.ndarray) -> float:
     """Return the largest standard deviation of the bands' phases relative to their mean [rad]."""

@@ -321,20 +321,23 @@ def _maximised(located: Located, white: Located, values: np.ndarray, likelihood:
     value = local.value + rise + marginal.log_volume
     if likelihood.nuisance.is_coarse:
         assert isinstance(white, WhiteMeans)
-        shares = _determined(information, likelihood, n_held)
+        shares = _determined(information, likelihood, before, n_held)
         value -= np.sum(shares * white.log_excess(before, signals)[:, n_held:], axis=1) / 2
     return value, values, information, local
 
 
-def _determined(information: np.ndarray, likelihood: Likelihood, n_held: int = 0) -> np.ndarray:
+def _determined(information: np.ndarray, likelihood: Likelihood, values: np.ndarray,
+                n_held: int = 0) -> np.ndarray:
     """Return the share of the information about each parameter that is due to the direct path.
 
-    `information`, [M, Q, Q], is that about the parameters after the first `n_held`.
+    `information`, [M, Q, Q], is that about the parameters `values` after the first `n_held`.
     """
-    prior = likelihood.nuisance
-    known = (np.diag(prior.precision) + prior.information)[n_held:, n_held:]
-    return 1 - np.diagonal(
-        np.linalg.solve(information, known[None]), axis1=1, axis2=2)
+    prior, noise = likelihood.nuisance, likelihood.factors.noise
+    known = (np.diag(prior.precision) + prior.information)[None]
+    if noise is not None:
+        known = known - prior.hidden(prior.noise_weights(values @ prior.gains.T, noise)[1])
+    return 1 - np.diagonal(np.linalg.solve(
+        information, known[:, n_held:, n_held:]), axis1=1, axis2=2)
 
 
 def expanded_at(conditional: Conditional, likelihood: Likelihood, points: np.ndarray,
@@ -347,12 +350,13 @@ def expanded_at(conditional: Conditional, likelihood: Likelihood, points: np.nda
     located, white, values = _settled(conditional, likelihood, points, values, signals)
     value, values, _, local = _maximised(located, white, values, likelihood, signals)
     if values.shape[1]:
-        local = _with_volume(located.local(values, signals), white, likelihood)
+        local = _with_volume(located.local(values, signals), white, values, likelihood)
     marginal = marginalise(local.information, local.gradient)
     return value, marginal.gradient, marginal.information
 
 
-def _with_volume(local: Local, white: Located, likelihood: Likelihood) -> Local:
+def _with_volume(local: Local, white: Located, values: np.ndarray, likelihood: Likelihood
+                 ) -> Local:
     """Add the derivative of the parameters' volume with respect to the point to the gradient.
 
     The curvature in the parameters that the direct path determines is proportional to its
@@ -361,7 +365,8 @@ def _with_volume(local: Local, white: Located, likelihood: Likelihood) -> Local:
     prior = likelihood.nuisance
     if prior.is_coarse:
         assert isinstance(white, WhiteMeans)
-        determined = np.sum(_determined(local.information[:, 3:, 3:], likelihood), axis=1)
+        determined = np.sum(_determined(
+            local.information[:, 3:, 3:], likelihood, values), axis=1)
         local.gradient[:, :3] -= determined[:, None] / 2 * white.growth[:, :3]
     return local
 
@@ -390,7 +395,7 @@ def one_step(conditional: Conditional, likelihood: Likelihood, starts: Starts, s
     """
     points = starts.points
     located, white, values = _settled(conditional, likelihood, points, starts.values, signals)
-    local = _with_volume(located.local(values, signals), white, likelihood)
+    local = _with_volume(located.local(values, signals), white, values, likelihood)
     marginal = marginalise(local.information, local.gradient)
     step = step_to_maximum(marginal.information, marginal.gradient)
     whole = np.zeros_like(local.gradient)

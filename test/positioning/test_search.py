@@ -87,7 +87,8 @@ def test_the_gradient_contains_the_change_of_the_volume_of_phases(codebook):
 
 
 @pytest.mark.parametrize(('changes', 'tolerance'), [
-    ({}, 0.05), ({'timing_std_s': 1e-8}, 0.15), ({'user_gain_std_db': 2.0}, 0.15)], ids=str)
+    ({}, 0.05), ({'timing_std_s': 1e-8}, 0.15), ({'user_gain_std_db': 2.0}, 0.15),
+    ({'user_gain_std_db': 2.0, 'noise_psd_dbm_hz': -80.0}, 0.15)], ids=str)
 def test_the_value_at_any_point_is_the_average_over_the_parameters(codebook, changes, tolerance):
     """Also far from the mode, where the direct path is stronger or weaker than received."""
     scenario = dataclasses.replace(SCENARIO, band_phase_std_rad=2 * np.pi, **changes)
