@@ -199,6 +199,12 @@ class _Factor(NamedTuple):
             sightings, of_sighting.slices, strict=True)])
         # This does not change the masses.
         sheets.covariances[:n] += symmetric(derivative @ spread @ derivative.swapaxes(1, 2))
+        # A pose that is off moves a sheet away from a region without extent along an axis. The
+        # likeliest point in it then depends on the errors of the pose.
+        points[:n] = move_inside(
+            sheets.means[:n], np.linalg.inv(sheets.covariances[:n]), boxes[:, :n],
+            select(frames, slice(n)))
+        near = frames.to_site(to_positions(points))
         gaussians = sheets.inside(boxes, frames, near)
         positions, log_ratio = gaussians.sample(standard_normal(_OF_SHEET))
         inside, _ = _moments(positions, gaussians.logarithm(positions) + log_ratio)

@@ -281,6 +281,23 @@ def test_a_density_on_a_line_is_a_likelihood_along_it():
     np.testing.assert_allclose(fused.covariance[1, 1], weights @ (y - mean)**2, rtol=0.05)
 
 
+def test_a_turned_surface_sees_users_beside_the_line_that_they_are_on():
+    """The user is where the line has the range of the sheet, which a turn does not change."""
+    std, line = np.array([1e-3, 2e-5, 2e-5]), np.array([[10.0, -5.0, 0.4], [10.0, 5.0, 0.4]])
+    pose = Pose((5.0, -5 * 3**0.5, 0.0), (0.0, 0.0, 0.5, 3**0.5 / 2), (0.0, 0.5))
+    place, turn = np.array([10.0, 1.5, 0.4]), np.radians([0.0, 0.0, 0.0, 0.5, 0.3, 0.7])
+    seen = dataclasses.replace(sheets(
+        dataclasses.replace(pose, uncertainty=EXACT),
+        pose.to_site(pose.displaced(turn).to_surface(place)), std=std), pose=pose)
+    fused, sight = fuse([seen], line), place - pose.origin
+    along = sight[1] / np.linalg.norm(sight)
+    assert fused.mean[1] == pytest.approx(place[1], abs=std[0] / along)
+    assert np.sqrt(fused.covariance[1, 1]) == pytest.approx(std[0] / along, rel=0.05)
+    # The logarithm of the density of the turn, relative to its maximum.
+    across = np.cross(sight, turn[3:]) / np.radians(0.5)
+    assert fused.log_agreement == pytest.approx(-across @ across / (sight @ sight) / 2, abs=0.1)
+
+
 def test_an_uncertain_pose_widens_the_posterior_by_its_covariance():
     place = np.array([10.0, 0.0, 0.0])
     uncertain = Pose(uncertainty=(0.3, 0.0))
