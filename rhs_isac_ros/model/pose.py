@@ -136,6 +136,23 @@ class Pose:
         by_error = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=-1)
         return by_error @ self.covariance @ np.swapaxes(by_error, -1, -2)
 
+    def scatter(self, positions: np.ndarray) -> np.ndarray:
+        """Return `spread` to second order: the mean squares of errors of positions [..., 3].
+
+        A turn moves a position along a sphere around the surface, so it changes the distance only
+        to second order. This matters where signals determine the range far better.
+        """
+        sights, turns = positions - self.origin, self.covariance[3:, 3:]
+        # Twice the coordinates of (a . x) a - |a|^2 x, the second-order move of x by a turn a, are
+        # quadratic forms of a. Their moments are those of products of Gaussians.
+        halves = np.eye(3)[:, :, None] * sights[..., None, None, :] / 2
+        forms = (halves + np.swapaxes(halves, -1, -2)
+                 - sights[..., :, None, None] * np.eye(3)) @ turns
+        means = np.trace(forms, axis1=-2, axis2=-1)
+        squares = np.einsum('...iab,...jba->...ij', forms, forms)
+        bent: np.ndarray = (means[..., None] * means[..., None, :] + 2 * squares) / 4
+        return self.spread(positions) + bent
+
     def spread_of_vectors(self, vectors: np.ndarray) -> np.ndarray:
         """Return the covariances that the pose adds to vectors [..., 3], such as velocities."""
         turns = _cross_matrices(vectors)

@@ -256,7 +256,7 @@ class Estimate:
         if isinstance(self.reason, tuple):
             return self.of_each([self[n].to_site(pose) for n in range(len(self.reason))], SITE)
         mean, velocity = pose.to_site(self.mean), pose.vectors_to_site(self.velocity)
-        spread = pose.spread(mean)
+        spread = pose.scatter(mean)
 
         def widened() -> Mixture:
             assert self.mixture is not None

@@ -104,6 +104,22 @@ def test_the_spread_is_the_covariance_of_displaced_positions():
                                slopes @ root @ root.T @ np.swapaxes(slopes, 1, 2), rtol=1e-6)
 
 
+def test_a_turn_also_moves_positions_along_the_line_of_sight_to_second_order():
+    root = np.diag([0.0, 0.0, 0.0, 0.05, 0.03, 0.08])
+    pose = Pose(TILTED.position_m, TILTED.quaternion, root @ root)
+    errors = np.random.default_rng(5).standard_normal((2000, 6)) @ root
+    # Opposite errors leave no mean of the first order.
+    offsets = np.array([pose.displaced(one).to_site(PLACES) for one in np.concatenate(
+        [errors, -errors])]) - pose.to_site(PLACES)
+    found, places = pose.scatter(pose.to_site(PLACES)), pose.to_site(PLACES) - pose.origin
+    sights = places / np.linalg.norm(places, axis=1, keepdims=True)
+    along = np.mean(np.sum(offsets * sights, axis=2)**2, axis=0)
+    np.testing.assert_allclose(
+        np.einsum('np,npq,nq->n', sights, found, sights), along, rtol=0.1)
+    np.testing.assert_allclose(
+        np.trace(found, axis1=1, axis2=2), np.mean(np.sum(offsets**2, axis=2), axis=0), rtol=0.05)
+
+
 def test_the_errors_of_a_pose_turn_velocities():
     turned = Pose(uncertainty=np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 1e-4]))
     np.testing.assert_allclose(turned.spread_of_vectors(np.array([2.0, 0.0, 0.0])),

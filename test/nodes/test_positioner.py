@@ -187,7 +187,7 @@ class TestNeural:
         np.testing.assert_array_equal(estimates[1].position, [9.0, 0.5, 0.25])
         np.testing.assert_allclose(
             estimates[1].covariance_m2,
-            2 * np.eye(3) + node.scenario.pose.spread(np.array([9.0, 0.5, 0.25])))
+            2 * np.eye(3) + node.scenario.pose.scatter(np.array([9.0, 0.5, 0.25])))
 
 
 class TestPlugin:

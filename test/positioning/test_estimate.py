@@ -45,9 +45,9 @@ def test_a_position_in_the_site_contains_the_errors_of_the_pose():
     batch = Estimate.of_each([found, Estimate.without_fix('none')])
     for placed in found.to_site(pose), batch.to_site(pose)[0]:
         np.testing.assert_allclose(
-            placed.covariance, found.to_site(exact).covariance + pose.spread(placed.mean))
+            placed.covariance, found.to_site(exact).covariance + pose.scatter(placed.mean))
         np.testing.assert_allclose(placed.mixture.moments()[1] - found.covariance,
-                                   pose.spread(placed.mean))
+                                   pose.scatter(placed.mean))
 
 
 def test_a_position_behind_the_surface_is_no_fix(small):

@@ -93,7 +93,7 @@ def test_the_codebook_of_the_signals_selects_the_estimator(
                 estimate.latency_s) == (5, 2, codebook.id, f'fixed {codebook.id}', 1.0)
         assert (estimate.position == PLACE).all()
         np.testing.assert_allclose(
-            estimate.covariance_m2, np.eye(3) + scenario.pose.spread(PLACE), rtol=1e-12)
+            estimate.covariance_m2, np.eye(3) + scenario.pose.scatter(PLACE), rtol=1e-12)
         assert estimate.crlb_m2 == pytest.approx(crlb(scenario, codebook, PLACE[None])[0])
 
 
