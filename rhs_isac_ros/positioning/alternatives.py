@@ -133,10 +133,10 @@ class Blocked:
         return whitened
 
     def places(self, whitened: np.ndarray, prior: NuisancePrior
-               ) -> tuple[np.ndarray, np.ndarray, float]:
+               ) -> tuple[np.ndarray, np.ndarray, float, float]:
         """Return a place without a direct path, and the level of the signals; see `Outside`."""
         level = float(np.mean(np.abs(whitened)**2))
-        return np.array([[_FAR_M, 0.0, 0.0]]), np.zeros((1, len(prior))), level**0.5
+        return np.array([[_FAR_M, 0.0, 0.0]]), np.zeros((1, len(prior))), 1.0, level**0.5
 
     def given(self, wrong: float) -> 'Blocked':
         """Return the alternative; whether a user is in sight does not depend on a prior."""
@@ -244,11 +244,11 @@ class Outside:
         return found + prior.log_evidence_of_aligned(aligned)
 
     def places(self, whitened: np.ndarray, prior: NuisancePrior
-               ) -> tuple[np.ndarray, np.ndarray, float]:
+               ) -> tuple[np.ndarray, np.ndarray, float, float]:
         """Return the most likely places of a user elsewhere for whitened signals of one shot.
 
-        Returns points (r [m], u, v), [P, 3], parameters that fit there, [P, Q], and the factor of
-        the signals that is not a parameter.
+        Returns points (r [m], u, v), [P, 3], parameters that fit there, [P, Q], the share of the
+        evidence that is due to them, and the factor of the signals that is not a parameter.
         """
         return *self._best(whitened, prior).places(whitened, prior), 1.0
 
@@ -367,8 +367,9 @@ class _Templates:
         tolerated = max_residual + _ERROR * self._energy
         return bool(((residual <= tolerated) & np.isfinite(self._offset)).any())
 
-    def places(self, whitened: np.ndarray, prior: NuisancePrior) -> tuple[np.ndarray, np.ndarray]:
-        """Return the best points and their parameters for one shot; see `Outside.places`."""
+    def places(self, whitened: np.ndarray, prior: NuisancePrior
+               ) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return the best points, parameters and a share for one shot; see `Outside.places`."""
         outputs = self._outputs(whitened[None])[0][:, self._index]
         energy, radii = self._state.energy(whitened), Resolution.of(
             prior.scenario).separation(prior.is_coarse)
@@ -376,7 +377,9 @@ class _Templates:
             prior, np.sum(np.abs(outputs), axis=0) * self._scale / 2, energy, whitened.size)
         likely = likely + self._offset
         half, parts = _RANGE_RATIO**0.5, []
-        for index in np.argsort(-likely, axis=None)[:_PLACES]:
+        best = np.argsort(-likely, axis=None)[:_PLACES]
+        share = float(np.exp(log_sum(likely.ravel()[best]) - log_sum(likely)))
+        for index in best:
             place = np.unravel_index(index, likely.shape)
             centre_m = 2 / float(self._scale[place[0], 0])
             range_m = np.arange(centre_m / half, centre_m * half, radii[0] / 3)
@@ -391,7 +394,7 @@ class _Templates:
         value, points, values = map(np.concatenate, zip(*parts, strict=True))
         order = np.argsort(-value, kind='stable')
         order = order[separate(np.zeros(len(order), int), points[order], radii)][:_PLACES]
-        return points[order], values[order]
+        return points[order], values[order], share
 
     def sheets(self, whitened: np.ndarray, prior: NuisancePrior) -> Sheets:
         """Merge the cells of the grid with the most mass; see `Outside.sheets`."""

@@ -73,9 +73,6 @@ _NARROW = 64
 _DOUBT = 0.05
 # Log odds of an alternative below which averages over surfaces leave no doubt.
 _CLEAR = -3.0
-# Number of modes of the average over surfaces, which only shows whether there is a doubt. The
-# others contain 1 % of its evidence.
-_AVERAGED = 32
 
 
 class SearchEstimator(abc.ABC):
@@ -375,7 +372,7 @@ class SearchEstimator(abc.ABC):
         if scope.alternatives and not isinstance(self._refinement, OneState):
             # The margin of the refinement admits modes that count only for some states.
             averaged = self._samples(*self._averaging.refine(likely_modes(
-                coarse, _AVERAGED), signals, scope.table), signals)
+                coarse), signals, scope.table), signals)
         means, covariances = self._moments(modes, samples)
         # If the model holds, twice the residual energy, averaged over the posterior, has the mean
         # of a chi-square variable. At the best of several modes, it is smaller than the average.
@@ -428,9 +425,12 @@ class SearchEstimator(abc.ABC):
             ratios, values, seen = log_ratios_of(
                 one, self._likelihood, signals, seen, aligned, shadow, in_sight)
             for n in np.flatnonzero((gains > 0) & (one.log_odds + ratios > _CLEAR)):
-                points, parameters, level = one.places(seen[n], prior)
-                ratios[n] += self._refinement.gain(points, parameters + values[n], Signals(*(
-                    each / level for each in select(signals, [n])))) - gains[n]
+                points, parameters, share, level = one.places(seen[n], prior)
+                gain = self._refinement.gain(points, parameters + values[n], Signals(*(
+                    each / level for each in select(signals, [n]))))
+                # Sets of failed elements are not searched at the other places.
+                others = max(1 - share, np.finfo(float).tiny)
+                ratios[n] += np.logaddexp(np.log(others), np.log(share) + gain) - gains[n]
             found[one.name] = ratios
             if isinstance(one, Outside):
                 outside = [functools.partial(one.sheets, each, prior) for each in seen]

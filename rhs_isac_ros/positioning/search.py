@@ -35,6 +35,9 @@ from rhs_isac_ros.positioning.sheets import Inside, Sheets
 # which is accurate to one Gauss-Newton step, and after exact steps.
 GRID_MARGIN = 8.0
 EXACT_MARGIN = 7.0
+# That of modes of averages over surfaces, which only show whether there is a doubt, and of sets of
+# failed elements: they contain 99 % of the evidence.
+LIKELY_MARGIN = 4.6
 # Maximum number of exact steps. Few modes need more than two, unless signals are strong. At the
 # border of the region, small gains may alternate.
 _STEPS = 8
@@ -190,11 +193,10 @@ def modes_from(starts: Starts, likelihood: Likelihood, signals: Signals, aligned
                   _STEPS if is_last else _COARSE, EXACT_MARGIN + extra_margin)
 
 
-def likely_modes(modes: Modes, n: int) -> Modes:
-    """Return the first n modes of each shot, the most likely first, without those of no weight."""
-    of_shot = Segments.of_keys(modes.shots)
-    return select(modes, (of_shot.places < n) & heaviest(
-        of_shot, modes.log_likelihood, EXACT_MARGIN))
+def likely_modes(modes: Modes) -> Modes:
+    """Return the modes of each shot, the most likely first, without those of little weight."""
+    return select(modes, heaviest(
+        Segments.of_keys(modes.shots), modes.log_likelihood, LIKELY_MARGIN))
 
 
 def ascend(conditional: Conditional, likelihood: Likelihood, starts: Starts, signals: Signals,

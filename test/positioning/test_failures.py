@@ -245,8 +245,9 @@ def test_users_elsewhere_have_the_evidence_of_the_true_set(
     monkeypatch.setattr(alternatives, '_TEMPLATES', 1000)
     elsewhere = (Blocked(SCENARIO, received.size) if level_db
                  else Outside(SCENARIO, tabulate_outside(likelihood.model)))
-    points, values, level = elsewhere.places(
+    points, values, share, level = elsewhere.places(
         likelihood.signals(received).whitened[0], likelihood.nuisance)
+    assert 0.9 < share <= 1
     signals = likelihood.signals(received / level)
     starts = Starts(np.zeros(len(points), int), points, values)
     known, averaged = (
@@ -337,3 +338,20 @@ def test_sets_grow_from_the_best_points_and_from_the_best_of_each_direction():
     assert chosen[32:] == [n for pair in zip(range(100, 116), range(200, 216), strict=True)
                            for n in pair]
     assert failures.first_places(points[:5], np.ones(3)) == list(range(5))
+
+
+def test_signals_that_agree_with_hundreds_of_sets_and_places_determine_no_position(random_beams):
+    """The largest 48 hypotheses are then a small part of the posterior, and of its evidence."""
+    scenario = Scenario(
+        center_frequencies_hz=(9.89e9,), n_subbands=10, subband_width_hz=1.15e6, n_frames=2,
+        elements_per_side=(3, 7), element_interval_wavelengths=0.5, multipath_to_los_db=-22.0,
+        max_power_w=4e-10, roi_center_m=(4.8, -0.6, -1.6), roi_size_m=(3.6, 0, 4.6),
+        phase_std_rad=0.15, failed_element_share=0.0178)
+    codebook = random_beams(scenario, np.random.default_rng(0))
+    positions, received = System(scenario, codebook).pairs(10, 0)
+    estimate = make_estimator('bayes', scenario, codebook, reject_outside=True).estimate(received)
+    errors = (estimate.mean - positions)[estimate.fix][:, ::2]
+    covariance = estimate.covariance[estimate.fix][:, ::2, ::2]
+    squares = np.sum(errors * np.linalg.solve(covariance, errors[..., None])[..., 0], axis=1)
+    assert len(squares) >= 9
+    assert np.mean(squares) < 3
