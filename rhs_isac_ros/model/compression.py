@@ -33,8 +33,6 @@ _NEGLIGIBLE, _ROUGH = 1e-12, 1e-3
 # Largest delay of drawn multipath, in delay spreads; nodes of its panels, and change of the phase
 # over the band from one node to the next [rad].
 _REACH, _NODES, _PHASE_PER_NODE_RAD = 28.0, 64, 3.0
-# Share of the power of the strongest part of drawn multipath below which parts are left out.
-_DRAWN = 1e-10
 # Number of complex numbers to draw at a time.
 _BLOCK_NUMBERS = 1 << 22
 
@@ -117,10 +115,10 @@ def scattered_parts(scenario: Scenario, radiation: np.ndarray) -> list[np.ndarra
     parts = []
     for band, one in enumerate(radiation):
         over, frames = _terms(scenario, one)
-        root = multipath.square_root(_correlated(scenario, band, frames))
-        power = np.sum(np.abs(root)**2, axis=0)
-        root = root[:, power > _DRAWN * power.max()]
-        parts.append(np.tensordot(over, root.reshape(*frames.shape[:2], -1), axes=1))
+        root = multipath.drawing_root(_correlated(scenario, band, frames))
+        part = np.tensordot(over, root.reshape(*frames.shape[:2], -1), axes=1)
+        # Singular vectors, too, depend on rounding.
+        parts.append(multipath.turned(part.reshape(-1, part.shape[2])).reshape(part.shape))
     return parts
 
 

@@ -47,8 +47,8 @@ from rhs_isac_ros.model.los import Waves, boresight_axes, direct_gain, draw_bloc
 from rhs_isac_ros.model.multipath import (
     complex_normal,
     draw_multipath,
+    drawing_root,
     scattered_covariance,
-    square_root,
 )
 from rhs_isac_ros.model.scenario import Scenario
 from rhs_isac_ros.model.surface import NOMINAL, Beamforming, combine, radiation_matrix
@@ -413,7 +413,7 @@ class MeasurementModel:
                 white = complex_normal(signals.shape, rng)
                 # Factors act on the multipath, but not on the noise.
                 roots = model.combined_root if factors is None else map(
-                    square_root, scattered_covariance(scenario, model.radiation))
+                    drawing_root, scattered_covariance(scenario, model.radiation))
                 for band, root in enumerate(roots):
                     signals[:, band] += white[:, band, :root.shape[1]] @ root.T
                 if factors is None:

@@ -29,6 +29,8 @@ _MAX_MATRIX = 1024
 _BLOCK_NUMBERS = 1 << 22
 # Quadrature nodes along each side of the region of interest; few suffice, as 1 / r^2 is smooth.
 _ROI_NODES = 24
+# Share of the largest eigenvalue of a covariance below which drawn multipath lacks eigenvectors.
+_DRAWN = 1e-10
 
 
 def multipath_covariance(scenario: Scenario) -> np.ndarray:
@@ -360,12 +362,12 @@ def multipath_factors(scenario: Scenario) -> tuple[tuple[np.ndarray | None, np.n
     """Compute the factors with which `draw_multipath` correlates the gains.
 
     For each band, these are G [N_E, r] with G G^H = V_i as declared, or None for many elements,
-    and L [N_SB F, s] with L L^H = K_ft; r and s are the numerical ranks.
+    and L [N_SB F, s] with L L^H = K_ft; see `drawing_root`.
     """
     has_matrix = declared_covariance(scenario).matrix is not None
     matrices = multipath_covariance(scenario) if has_matrix else [None] * scenario.n_bands
     return tuple(
-        (None if spatial is None else square_root(spatial), square_root(correlation))
+        (None if spatial is None else drawing_root(spatial), drawing_root(correlation))
         for spatial, correlation in zip(
             matrices, measurement_correlation(scenario), strict=True))
 
@@ -459,3 +461,25 @@ def square_root(matrix: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(matrix)
     keep = values > values[-1] * len(values) * np.finfo(float).eps
     return read_only(vectors[:, keep] * np.sqrt(values[keep]))
+
+
+def drawing_root(matrix: np.ndarray) -> np.ndarray:
+    """Return R [n, r] with R R^H = matrix, without small eigenvalues, for random numbers.
+
+    Rounding, which differs among processors, determines neither r nor R; see `turned`.
+    """
+    values, vectors = np.linalg.eigh(matrix)
+    keep = values > values[-1] * _DRAWN
+    return read_only(turned(vectors[:, keep] * np.sqrt(values[keep])))
+
+
+def turned(root: np.ndarray) -> np.ndarray:
+    """Return R U, complex128 [n, r], which is the same for all R that have the same R R^H.
+
+    Phases of eigenvectors, and vectors of equal eigenvalues, depend on rounding. The unitary U
+    brings R as close as possible to constant numbers.
+    """
+    constant = complex_normal(root.shape, np.random.default_rng(0))
+    left, _, right = np.linalg.svd(np.conj(root.T) @ constant, full_matrices=False)
+    result: np.ndarray = root @ (left @ right)
+    return result

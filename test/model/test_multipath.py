@@ -172,14 +172,30 @@ def test_measurement_correlation_is_the_kronecker_product_of_the_vectors(case):
 
 
 def test_factors_square_to_the_covariances(case):
+    """They lack eigenvalues below 1e-10 of the largest one."""
     factors = mp.multipath_factors(case.scenario)
-    for band, (spatial, rows) in enumerate(factors):
-        v = case.vectors['V'][band]
-        np.testing.assert_allclose(
-            spatial @ spatial.conj().T, v, rtol=0, atol=1e-10 * np.abs(v).max())
+    for band, factors_of_band in enumerate(factors):
         over_f, over_t = case.vectors['K_f'][band], case.vectors['K_t'][band]
-        np.testing.assert_allclose(
-            rows @ rows.conj().T, np.kron(over_f, over_t), rtol=0, atol=1e-10)
+        for factor, expected in zip(
+                factors_of_band, (case.vectors['V'][band], np.kron(over_f, over_t)), strict=True):
+            np.testing.assert_allclose(factor @ factor.conj().T, expected, rtol=0,
+                                       atol=1e-10 * np.linalg.norm(expected, 2))
+
+
+@pytest.mark.parametrize('scenario', [
+    Scenario(), Scenario(multipath_direction_deg=(20.0, 5.0)), Scenario(delay_spread_s=1e-9)],
+    ids=['even', 'uneven', 'flat'])
+def test_rounding_changes_no_draw(scenario):
+    """Eigenvectors have other phases, and equal eigenvalues other vectors, on other processors."""
+    (matrix, *_), rng = mp.multipath_covariance(scenario), np.random.default_rng(0)
+    expected = mp.drawing_root(matrix)
+    nearly = matrix * (1 + 1e-14 * rng.normal(size=matrix.shape))
+    np.testing.assert_allclose(
+        mp.drawing_root((nearly + nearly.conj().T) / 2), expected,
+        atol=1e-5 * np.abs(expected).max())
+    turn = np.linalg.qr(mp.complex_normal((expected.shape[1],) * 2, rng))[0]
+    np.testing.assert_allclose(
+        mp.turned(expected @ turn), expected, atol=1e-9 * np.abs(expected).max())
 
 
 N_DRAWS = 20_000

@@ -121,7 +121,7 @@ def test_estimates_from_draws_agree_with_those_from_modes(codebook):
 
 
 def test_the_estimate_of_a_posterior_is_that_of_the_estimator(codebook):
-    estimator, rng = make_estimator('bayes', WEAK, codebook), np.random.default_rng(4)
+    estimator, rng = make_estimator('bayes', WEAK, codebook), np.random.default_rng(0)
     for signals in simulate_received(WEAK, codebook, WEAK.sample_positions(5, rng), rng):
         expected, posterior = estimator.estimate(signals), estimator.posterior(signals)
         mean, covariance = posterior.mixture.moments()
@@ -142,7 +142,7 @@ def test_peaks_above_noise_are_searched_where_other_surfaces_may_favour_them(
     fit, drawn = DrawnPosterior.fit, []
     monkeypatch.setattr(
         DrawnPosterior, 'fit', lambda *arguments: drawn.append(fit(*arguments)) or drawn[-1])
-    rng = np.random.default_rng(2)
+    rng = np.random.default_rng(7)
     received = simulate_received(WEAK, codebook, WEAK.sample_positions(12, rng), rng)
     counts = []
     for options in ({}, {'left_out': 5e-5}):

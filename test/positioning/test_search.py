@@ -94,8 +94,9 @@ def test_the_value_at_any_point_is_the_average_over_the_parameters(codebook, cha
     scenario = dataclasses.replace(SCENARIO, band_phase_std_rad=2 * np.pi, **changes)
     likelihood, point = Likelihood(System(scenario, codebook)), np.array([4.0, 0.1, -0.05])
     prior, n_bands = likelihood.nuisance, scenario.n_bands
-    signals = likelihood.signals(
-        MeasurementModel(scenario, codebook).sample(
+    # Newton steps begin at the median gain, which is therefore the true one.
+    signals = likelihood.signals(MeasurementModel(
+        dataclasses.replace(scenario, user_gain_std_db=0.0), codebook).sample(
             to_positions(point[None]), np.random.default_rng(2)))
     points = point * np.array([[0.85], [1.0], [1.2]]) ** [1, 0, 0]
     values = np.zeros((len(points), len(prior)))
