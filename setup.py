@@ -52,11 +52,12 @@ setup(
         'recording': ['mcap>=1.6'],
         'samples': ['sigmf'],
         'touchstone': ['scikit-rf'],
+        'matlab': ['h5py'],
         'watch': ['rich'],
         'view': ['rerun-sdk>=0.22.1,<0.42', 'pyarrow'],
         'all': [
             'matplotlib', 'joblib', 'dask', 'distributed', 'tqdm', 'scikit-learn',
-            'pymoo', 'mcap>=1.6', 'sigmf', 'scikit-rf', 'rich', 'rerun-sdk>=0.22.1,<0.42',
+            'pymoo', 'mcap>=1.6', 'sigmf', 'scikit-rf', 'h5py', 'rich', 'rerun-sdk>=0.22.1,<0.42',
             'pyarrow'],
         'docs': ['sphinx', 'furo', 'myst-nb'],
         'test': ['pytest', 'hypothesis', 'filterpy', 'rosbags', 'mcap-ros2-support'],

@@ -25,7 +25,7 @@ KEYS = {'docutils': 'python3-sphinx', 'threadpoolctl': 'python3-sklearn'} | {
 # Libraries without a key, by the name of the import: their requirement in an extra of setup.py.
 # mcap requires lz4 and zstandard.
 PIP_ONLY = {
-    'adi': None, 'distributed': 'distributed', 'h5py': None, 'jax': None, 'lz4': 'mcap>=1.6',
+    'adi': None, 'distributed': 'distributed', 'h5py': 'h5py', 'jax': None, 'lz4': 'mcap>=1.6',
     'mcap': 'mcap>=1.6', 'mcap_ros2': 'mcap-ros2-support', 'pymoo': 'pymoo',
     'rerun': 'rerun-sdk>=0.22.1,<0.42',
     'rosbags': 'rosbags', 'sigmf': 'sigmf', 'sionna': None, 'skrf': 'scikit-rf',

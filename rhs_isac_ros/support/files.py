@@ -297,7 +297,7 @@ def _read_matlab5(path: str | Path, names: set[str]) -> dict[str, np.ndarray]:
 
 
 def _read_hdf5(path: str | Path, names: set[str]) -> dict[str, np.ndarray]:
-    with optional_import('reading files of MATLAB 7.3'):
+    with optional_import('reading files of MATLAB 7.3', extra='matlab'):
         import h5py
 
     with h5py.File(path) as file:
