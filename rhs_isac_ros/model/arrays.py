@@ -60,6 +60,12 @@ def mixture_weights(log_weights: np.ndarray, axis: int | tuple[int, ...] = -1
     return weights / total, np.squeeze(highest + np.log(total), axis=axis)
 
 
+def n_sufficient(log_weights: Sequence[float] | np.ndarray, left_out: float) -> int:
+    """Return how many weights, [W] in descending order, have all but a share of their sum."""
+    weights, _ = mixture_weights(np.asarray(log_weights))
+    return 1 + int(np.count_nonzero(1 - np.cumsum(weights) > left_out))
+
+
 def log_sum(values: np.ndarray) -> float:
     """Return the logarithm of the sum of exponentials."""
     highest = float(values.max())

@@ -24,7 +24,7 @@ import numpy as np
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import MeasurementModel, Scenario
-from rhs_isac_ros.model.arrays import adjoint, blocks, mixture_weights
+from rhs_isac_ros.model.arrays import adjoint, blocks, n_sufficient
 from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
 from rhs_isac_ros.model.gaussian import energy_limit
 from rhs_isac_ros.model.los import frame_gains
@@ -45,14 +45,7 @@ from rhs_isac_ros.positioning.likelihood import (
     assemble,
 )
 from rhs_isac_ros.positioning.nuisance import NuisancePrior
-from rhs_isac_ros.positioning.search import (
-    LIKELY_MARGIN,
-    Modes,
-    OneState,
-    Refinement,
-    ascend,
-    predict,
-)
+from rhs_isac_ros.positioning.search import Modes, OneState, Refinement, ascend, predict
 from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.support.recent import Recent
 
@@ -90,9 +83,9 @@ _TRIED_EVERYWHERE = 4
 # before and during the exact steps.
 _MARGIN = 9.0
 _STEP_MARGIN = 27.0
-# Smallest number of hypotheses to keep. Signals that say little about the position agree with
-# hundreds of them.
-_HYPOTHESES = 48
+# Smallest number of hypotheses to keep, and share of those left out: signals that say little
+# about the position agree with hundreds of them.
+_HYPOTHESES, _LEFT_OUT = 48, 0.01
 # Number of exact steps.
 _STEPS = 2
 
@@ -185,7 +178,7 @@ class FailedElements:
         values, best = search.log_probabilities, max(search.log_probabilities.values())
         keys = sorted((key for key in values if values[key] >= best - _MARGIN),
                       key=lambda key: -values[key])
-        keys = keys[:_sufficient(np.array([values[key] for key in keys]))]
+        keys = keys[:max(_HYPOTHESES, n_sufficient([values[key] for key in keys], _LEFT_OUT))]
         sets = list(dict.fromkeys(failed for failed, _ in keys))
         conditionals = [self._model.failed_set(failed) for failed in sets]
         parts = []
@@ -199,14 +192,8 @@ class FailedElements:
                                 _STEPS, _STEP_MARGIN, number))
         modes = concatenate(*parts)
         order = modes.order
-        return select(modes, order[:_sufficient(modes.log_likelihood[order])]), conditionals
-
-
-def _sufficient(log_values: np.ndarray) -> int:
-    """Return how many of the largest values, [H], descending, contain almost all of their sum."""
-    weights, _ = mixture_weights(log_values)
-    left_out = 1 - np.cumsum(weights)
-    return max(_HYPOTHESES, 1 + int(np.count_nonzero(left_out > np.exp(-LIKELY_MARGIN))))
+        n = max(_HYPOTHESES, n_sufficient(modes.log_likelihood[order], _LEFT_OUT))
+        return select(modes, order[:n]), conditionals
 
 
 def first_places(points: np.ndarray, radii: np.ndarray) -> list[int]:

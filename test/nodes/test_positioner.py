@@ -208,6 +208,6 @@ class Mine(BayesEstimator):
     def test_the_plug_in_estimates(self, bench, node, send, codebooks):
         estimates = bench.collect(bench.add(Node, 'receiver'), m.PositionEstimate)
         node.dispatch(CodebookOffered(codebooks[0]))
-        send(1)
+        send(8)
         (estimate,) = bench.until(lambda: estimates)
         assert estimate.estimator == 'mine'
