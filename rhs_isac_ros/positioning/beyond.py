@@ -17,9 +17,9 @@ from rhs_isac_ros.model.arrays import log_size
 from rhs_isac_ros.model.geometry import to_polar
 from rhs_isac_ros.model.pose import Pose
 from rhs_isac_ros.model.scenario import Scenario
-from rhs_isac_ros.positioning.alternatives import farthest_range_m
 from rhs_isac_ros.positioning.estimate import Places, Sighting, regular
 from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.outside import farthest_range_m
 from rhs_isac_ros.positioning.segments import concatenate, select
 from rhs_isac_ros.positioning.sheets import Sheets
 from rhs_isac_ros.positioning.templates import standard_normal

@@ -12,7 +12,8 @@ import numpy as np
 
 from rhs_isac_ros import __version__
 from rhs_isac_ros.model import MeasurementModel
-from rhs_isac_ros.positioning import alternatives, templates
+from rhs_isac_ros.positioning import templates
+from rhs_isac_ros.positioning.outside import tabulate_outside
 from rhs_isac_ros.support.files import write_whole
 from rhs_isac_ros.system import System
 
@@ -48,7 +49,7 @@ def load_table(system: System, folder: str | Path | None = None,
     folder cannot be written, the table is kept only in memory. During the computation, `progress`
     is called with the completed share.
     """
-    tabulate = alternatives.tabulate_outside if outside else templates.tabulate
+    tabulate = tabulate_outside if outside else templates.tabulate
     if folder is None:
         return tabulate(model or system, progress)
     key = table_key(system)

@@ -15,16 +15,17 @@ from rhs_isac_ros.model.geometry import to_positions
 from rhs_isac_ros.model.hall import CONDITIONS, MultipathEstimate
 from rhs_isac_ros.model.impairments import draw_impairments
 from rhs_isac_ros.model.los import draw_blocked
-from rhs_isac_ros.positioning import Mixture, Tracker, alternatives, make_estimator
+from rhs_isac_ros.positioning import Mixture, Tracker, make_estimator
+from rhs_isac_ros.positioning import outside as outside_table
 from rhs_isac_ros.positioning.alternatives import (
     BLOCKED_LIMIT,
     LIMIT,
     Outside,
     log_ratios_of,
-    tabulate_outside,
 )
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.nuisance import NuisancePrior
+from rhs_isac_ros.positioning.outside import OutsideTemplates, tabulate_outside
 from rhs_isac_ros.positioning.search import OneState
 from rhs_isac_ros.positioning.segments import select
 from rhs_isac_ros.system import System
@@ -44,8 +45,8 @@ def test_the_prior_excludes_the_region_and_its_border(setting):
     scenario, _, arrays = setting
     weights = arrays['outer_weights']
     assert weights.sum() == pytest.approx(1)
-    points = alternatives._points(
-        alternatives._ranges(scenario), alternatives._directions(scenario))
+    points = outside_table._points(
+        outside_table._ranges(scenario), outside_table._directions(scenario))
     assert points.shape[:2] == weights.shape
     positions = to_positions(points)
     distance = np.linalg.norm(
@@ -63,13 +64,13 @@ def reference(setting):
     rng = np.random.default_rng(1)
     user = np.array([[7.0, 2.0, 1.0]])
     signals = model.whiten(model.sample(user, rng))[0]
-    ranges = alternatives._ranges(scenario)[[0, -1]]
+    ranges = outside_table._ranges(scenario)[[0, -1]]
     n = 80_000
     direction = rng.normal(size=(n, 3))
     direction[:, 0] = np.abs(direction[:, 0])
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     # Half a step beyond both ends, as the cells of the grid.
-    ratio = np.sqrt(alternatives._RANGE_RATIO)
+    ratio = np.sqrt(outside_table._RANGE_RATIO)
     distance = rng.uniform(ranges[0] / ratio, ranges[1] * ratio, n)
     positions = distance[:, None] * direction
     positions = positions[np.linalg.norm(
@@ -83,7 +84,7 @@ def test_evidence_is_the_average_likelihood(setting, reference):
     signals, _, exponent = reference
     highest = exponent.max()
     expected = highest + np.log(np.mean(np.exp(exponent - highest)))
-    (found,) = alternatives._Templates(scenario, arrays).log_evidence_of(
+    (found,) = OutsideTemplates(scenario, arrays).log_evidence_of(
         signals[None], NuisancePrior(model))
     assert found == pytest.approx(expected, abs=0.5)
 
@@ -98,7 +99,7 @@ def test_the_evidence_is_the_average_over_an_unknown_gain(random_beams):
     declared = dataclasses.replace(scenario, user_gain_std_db=0.5)
     likelihood = Likelihood(System(declared, codebook))
     arrays = tabulate_outside(likelihood.model)
-    table, known = alternatives._Templates(declared, arrays), NuisancePrior(MeasurementModel(
+    table, known = OutsideTemplates(declared, arrays), NuisancePrior(MeasurementModel(
         scenario, codebook))
     std = 0.5 * np.log(10) / 20
     gains = np.linspace(-6, 6, 601) * std
@@ -121,7 +122,7 @@ def test_the_evidence_is_the_average_over_an_unknown_level(setting, level_db, me
     signals *= 10**(level_db / 20)
     normal = np.linspace(-6, 6, 121)
     levels = 10**((median_db + std_db * normal) / 10)
-    exponent = [alternatives._Templates(scenario, arrays | {
+    exponent = [OutsideTemplates(scenario, arrays | {
         'outer_filters': arrays['outer_filters'] / np.float32(level**0.5),
         'outer_energy': arrays['outer_energy'] / np.float32(level)
     }).log_evidence_of(signals / level**0.5, prior)[0] - signals.size * np.log(level)
@@ -207,7 +208,7 @@ def test_templates_have_the_covariance_of_their_state(failing):
         combined_whitener=np.linalg.inv(model.combined_root @ root),
         whitener=np.linalg.inv(model.root @ root))
     found, expected = (
-        alternatives._Templates(model.scenario, *args).log_evidence_of(
+        OutsideTemplates(model.scenario, *args).log_evidence_of(
             one.whiten(signals), likelihood.nuisance)[0]
         for one, args in ((model, (arrays, state)), (changed, (tabulate_outside(changed),))))
     assert found == pytest.approx(expected + state.offset, abs=0.02)
@@ -223,6 +224,36 @@ def test_templates_outside_fit_a_measured_multipath(pytestconfig):
         for rejects in (False, True))
     np.testing.assert_array_equal(anywhere.mean, inside.mean)
     assert np.isfinite(anywhere.outside_probability).all()
+
+
+@pytest.mark.parametrize(('range_m', 'noise_dbm_hz'), [
+    (6.0, -135.0), (6.0, -115.0), (12.0, -105.0)])
+def test_a_gain_outside_does_not_scale_the_noise(
+        setting, random_beams, range_m, noise_dbm_hz):
+    """The evidence is the average over users of known gains."""
+    scenario = dataclasses.replace(
+        setting[0], noise_psd_dbm_hz=noise_dbm_hz, multipath_to_los_db=-6.0,
+        user_gain_std_db=4.0)
+    codebook = random_beams(scenario, np.random.default_rng(0))
+    likelihood = Likelihood(System(scenario, codebook))
+    known = dataclasses.replace(scenario, user_gain_std_db=0.0)
+    received = MeasurementModel(known, codebook).sample(
+        to_positions(np.array([[range_m, 0.3, 0.1]])), np.random.default_rng(1))
+    gains_db, logs = np.linspace(-12, 12, 25), []
+    for gain_db in gains_db:
+        one = dataclasses.replace(known, user_gain=10**(gain_db / 20))
+        of_gain = Likelihood(System(one, codebook))
+        logs.append(Outside(one, tabulate_outside(of_gain.model)).log_evidence_of(
+            of_gain.signals(received).whitened, np.zeros((1, 0)), of_gain.nuisance)[0]
+            - of_gain.log_det + likelihood.log_det)
+    prior = norm(scale=4.0).logpdf(gains_db)
+    expected = logsumexp(logs + prior) - logsumexp(prior)
+    outside = Outside(scenario, tabulate_outside(likelihood.model))
+    signals = likelihood.signals(received).whitened
+    alone = outside.log_evidence_of(signals, np.zeros((1, 1)), likelihood.nuisance)[0]
+    ratio = outside.noise_ratio(signals[0], likelihood)
+    assert ratio > 0.5
+    assert alone + ratio == pytest.approx(expected, abs=0.3)
 
 
 @pytest.mark.parametrize('change, n', [
@@ -256,7 +287,7 @@ def test_a_region_that_leaves_no_space_outside_is_always_accepted(setting):
     _, model, _ = setting
     arrays = tabulate_outside(model)
     arrays['outer_weights'][:] = 0
-    table = alternatives._Templates(model.scenario, arrays)
+    table = OutsideTemplates(model.scenario, arrays)
     signals = model.whiten(model.mean(np.array([[5.0, -2.0, 1.0]])))[0]
     assert table.log_evidence_of(signals[None], NuisancePrior(model)) == [-np.inf]
     assert not table.explain(signals, 1e9)
@@ -267,8 +298,8 @@ def test_templates_cover_all_ranges():
     counts = []
     for change in ({}, {'subband_width_hz': 12.5e6}, {'elements_per_side': 30}):
         scenario = dataclasses.replace(Scenario(), **change)
-        ranges = alternatives._ranges(scenario)
-        nodes, index = alternatives._template_ranges(scenario, ranges)
+        ranges = outside_table._ranges(scenario)
+        nodes, index = outside_table._template_ranges(scenario, ranges)
         assert (np.diff(index) >= 0).all()
         assert set(index) == set(range(len(nodes)))
         counts.append(len(nodes))

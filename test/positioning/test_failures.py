@@ -11,11 +11,13 @@ from rhs_isac_ros.model import MeasurementModel, Scenario
 from rhs_isac_ros.model.arrays import blocks
 from rhs_isac_ros.model.elements import DeclaredElements, ElementErrors
 from rhs_isac_ros.model.geometry import jacobian, to_polar, to_positions
-from rhs_isac_ros.positioning import alternatives, failures, make_estimator
-from rhs_isac_ros.positioning.alternatives import Blocked, Outside, tabulate_outside
+from rhs_isac_ros.positioning import failures, make_estimator
+from rhs_isac_ros.positioning import outside as outside_table
+from rhs_isac_ros.positioning.alternatives import Blocked, Outside
 from rhs_isac_ros.positioning.dispersed import DispersedLikelihood
 from rhs_isac_ros.positioning.grid import Starts
 from rhs_isac_ros.positioning.likelihood import Likelihood
+from rhs_isac_ros.positioning.outside import tabulate_outside
 from rhs_isac_ros.positioning.search import OneState, ascend
 from rhs_isac_ros.system import System
 
@@ -242,7 +244,7 @@ def test_users_elsewhere_have_the_evidence_of_the_true_set(
     surface = MeasurementModel(SCENARIO, codebook, with_failures(failed, [0.1, 0.8]))
     received = 10**(level_db / 20) * surface.sample(
         to_positions(point), np.random.default_rng(3))
-    monkeypatch.setattr(alternatives, '_TEMPLATES', 1000)
+    monkeypatch.setattr(outside_table, '_TEMPLATES', 1000)
     elsewhere = (Blocked(SCENARIO, received.size) if level_db
                  else Outside(SCENARIO, tabulate_outside(likelihood.model)))
     points, values, share, level = elsewhere.places(

@@ -11,7 +11,7 @@ import pytest
 
 from rhs_isac_ros.model import Pose, Scenario
 from rhs_isac_ros.positioning import store, templates
-from rhs_isac_ros.positioning.alternatives import tabulate_outside
+from rhs_isac_ros.positioning.outside import tabulate_outside
 from rhs_isac_ros.positioning.store import load_table
 from rhs_isac_ros.system import System
 
