@@ -51,7 +51,7 @@ _GAIN_ERROR = 0.01
 # Directions with a log-likelihood below the best by more than this at all ranges are ignored.
 _MARGIN = 20.0
 # Number of places at which noise is taken into account, and largest gain there, in standard
-# deviations and in nepers; largest number of gains: noise has no effect on stronger signals.
+# deviations and in nepers; largest number of gains: stronger signals are far above the noise.
 _NOISY, _GAIN_REACH, _GAINS = 32, 5.0, 2000
 # Smallest sum of the shares of noise in the measurements that has an effect.
 _LEAST_NOISE = 1.0

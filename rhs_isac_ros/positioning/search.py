@@ -35,8 +35,8 @@ from rhs_isac_ros.positioning.sheets import Inside, Sheets
 # which is accurate to one Gauss-Newton step, and after exact steps.
 GRID_MARGIN = 8.0
 EXACT_MARGIN = 7.0
-# That of modes of averages over surfaces, which only show whether there is a doubt, and of sets of
-# failed elements: they contain 99 % of the evidence.
+# That of modes of averages over surfaces, which only show whether there is a doubt: they contain
+# 99 % of the evidence.
 LIKELY_MARGIN = 4.6
 # Maximum number of exact steps. Few modes need more than two, unless signals are strong. At the
 # border of the region, small gains may alternate.
