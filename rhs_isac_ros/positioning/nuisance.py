@@ -334,9 +334,10 @@ class NuisancePrior(Exponents):
         `gains` are those of the bands, [M, N_B] [nepers], and `noise` is the share of noise in
         each measurement at a gain of 0, [n] or [M, n].
         """
-        power = np.exp(np.minimum(-2 * gains, _MAX_EXPONENT))
+        power = np.exp(np.clip(-2 * gains, -_MAX_EXPONENT, _MAX_EXPONENT))
         power = np.repeat(power, noise.shape[-1] // gains.shape[1], axis=1)
-        total = 1 + noise * (power - 1)
+        # Rounding may bring the share of noise above 1.
+        total = np.maximum(1 - noise, 0.0) + noise * power
         return 1 / np.sqrt(total), noise * power / total
 
     def hidden(self, shares: np.ndarray) -> np.ndarray:

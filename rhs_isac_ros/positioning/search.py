@@ -28,6 +28,7 @@ from rhs_isac_ros.positioning.likelihood import (
     Signals,
     WhiteMeans,
 )
+from rhs_isac_ros.positioning.nuisance import NuisancePrior
 from rhs_isac_ros.positioning.segments import Segments, concatenate, select
 from rhs_isac_ros.positioning.sheets import Inside, Sheets
 
@@ -47,6 +48,8 @@ _COARSE = 3
 _GAIN = 0.05
 # Share of the latest step by which the next one turns back, above which it is shortened.
 _TURN = 0.5
+# Longest step of a gain [nepers].
+_GAIN_STEP = 1.0
 # Parts of the longest step along a line, of which the best one is taken.
 _PARTS = 1.0, 0.25, 0.0625, 0.0
 # Log-likelihood per u and v by which modes are ordered that are equal up to rounding, as those of
@@ -402,7 +405,8 @@ def one_step(conditional: Conditional, likelihood: Likelihood, starts: Starts, s
     step = step_to_maximum(marginal.information, marginal.gradient)
     whole = np.zeros_like(local.gradient)
     if moves:
-        whole = _with_parameters(marginal, _inside(points, marginal, step, likelihood))
+        whole = _with_parameters(
+            marginal, _inside(points, marginal, step, likelihood), likelihood.nuisance)
     step, gain = whole[:, :3], _rise(local, whole)
     modes = Modes(
         starts.shots, points + step,
@@ -450,7 +454,8 @@ def predict(local: Local, likelihood: Likelihood) -> np.ndarray:
     """Predict the marginal log-likelihood after a Gauss-Newton step, float64 [M]."""
     marginal, limits = marginalise(local.information, local.gradient), _limits(likelihood)
     step = step_to_maximum(marginal.information, marginal.gradient)
-    whole = _with_parameters(marginal, np.clip(step, -limits, limits))
+    whole = _with_parameters(
+        marginal, np.clip(step, -limits, limits), likelihood.nuisance)
     return local.value + marginal.log_volume + _rise(local, whole)
 
 
@@ -458,10 +463,18 @@ def _limits(likelihood: Likelihood) -> np.ndarray:
     return likelihood.resolution.step_limits(likelihood.nuisance.is_coarse)
 
 
-def _with_parameters(marginal: Marginal, step: np.ndarray) -> np.ndarray:
-    """Append the best steps of the nuisance parameters to steps of the points, [M, 3 + Q]."""
+def _with_parameters(marginal: Marginal, step: np.ndarray, prior: NuisancePrior) -> np.ndarray:
+    """Append the best steps of the nuisance parameters to steps of the points, [M, 3 + Q].
+
+    Where noise hides the signals, hardly anything limits a gain without a prior. Its step is
+    limited, and all others with it.
+    """
     change = np.matmul(marginal.regression, step[..., None])[..., 0]
-    return np.hstack([step, marginal.offset + change])
+    whole = np.hstack([step, marginal.offset + change])
+    if prior.has_gain:
+        largest = np.abs(whole[:, 3:] @ prior.gains.T).max(axis=1)
+        whole *= (_GAIN_STEP / np.maximum(largest, _GAIN_STEP))[:, None]
+    return whole
 
 
 def _rise(local: Local, whole: np.ndarray) -> np.ndarray:

@@ -419,3 +419,20 @@ def test_regions_contain_users_on_lines_in_flat_channels_at_wide_angles_and_with
     inside = squares <= chdtri(np.count_nonzero(scenario.roi_size_m), 0.05)
     # Posteriors are not Gaussian; the standard error is 0.015.
     assert 0.9 < np.mean(inside) < 0.985
+
+
+@pytest.mark.parametrize('noise_psd_dbm_hz', [-94.0, -84.0])
+@pytest.mark.parametrize('changes', [{}, {'roi_size_m': (0, 10, 0)}], ids=['box', 'line'])
+def test_noise_that_hides_signals_of_unknown_gain_lets_no_search_diverge(
+        random_beams, noise_psd_dbm_hz, changes):
+    """Hardly anything then limits the gain."""
+    scenario = Scenario(**{
+        'center_frequencies_hz': (1.3e9, 1.5e9), 'n_subbands': 4, 'n_frames': 1,
+        'elements_per_side': 7, 'element_interval_wavelengths': 0.4, 'multipath_to_los_db': -29.0,
+        'roi_size_m': (8, 10, 4), 'user_gain_std_db': np.inf, 'timing_std_s': 6e-8,
+        'noise_psd_dbm_hz': noise_psd_dbm_hz} | changes)
+    codebook = random_beams(scenario, np.random.default_rng(0))
+    _, received = System(scenario, codebook).pairs(10, 0)
+    estimate = make_estimator('bayes', scenario, codebook).estimate(received)
+    assert np.isfinite(estimate.mean[estimate.fix]).all()
+    assert (np.linalg.eigvalsh(estimate.covariance[estimate.fix]) > -1e-9).all()
