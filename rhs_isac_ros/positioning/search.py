@@ -341,8 +341,12 @@ def _determined(information: np.ndarray, likelihood: Likelihood, values: np.ndar
     known = (np.diag(prior.precision) + prior.information)[None]
     if noise is not None:
         known = known - prior.hidden(prior.noise_weights(values @ prior.gains.T, noise)[1])
-    return 1 - np.diagonal(np.linalg.solve(
+    others = np.diagonal(np.linalg.solve(
         information, known[:, n_held:, n_held:]), axis1=1, axis2=2)
+    # What a few measurements of the multipath say about an offset may be far less than expected.
+    # Whatever remains is then not due to the direct path.
+    found: np.ndarray = 1 - np.clip(others, 0.0, 1.0)
+    return found
 
 
 def expanded_at(conditional: Conditional, likelihood: Likelihood, points: np.ndarray,

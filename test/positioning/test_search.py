@@ -117,6 +117,31 @@ def test_the_value_at_any_point_is_the_average_over_the_parameters(codebook, cha
     np.testing.assert_allclose(found[0], exact, atol=tolerance)
 
 
+def test_no_average_over_an_offset_exceeds_the_likelihood(random_beams):
+    """A few measurements of the multipath may say far less about the timing than expected."""
+    scenario = dataclasses.replace(
+        SCENARIO, center_frequencies_hz=(2.5e9,), n_subbands=2, n_frames=1, multipath_to_los_db=10,
+        band_phase_std_rad=2 * np.pi, timing_std_s=1e-6)
+    system = System(scenario, random_beams(scenario, np.random.default_rng(1)))
+    likelihood, n = Likelihood(system), 60
+    positions, received = system.pairs(n, 1)
+    points, signals = to_polar(positions), likelihood.signals(received)
+    # The timing in standard deviations, in order.
+    values = np.pad(np.linspace(-5, 5, 201)[:, None], [(0, 0), (0, 1)])
+    surplus = []
+    for shot in range(n):
+        one, point = select(signals, [shot]), points[[shot]]
+        white = likelihood.at(np.repeat(point, len(values), axis=0), values)
+        outputs = white.outputs(values, one)[:, 0]
+        given = white.local(values, one).value - 2 * outputs.real + np.log(
+            i0e(2 * np.abs(outputs))) + 2 * np.abs(outputs)
+        exact = log_sum(given) + np.log(10 / 200 / np.sqrt(2 * np.pi))
+        surplus.append(marginal_at(
+            likelihood, likelihood, point, values[[np.argmax(given)]], one)[0][0] - exact)
+    assert max(surplus) < 0.5
+    assert abs(np.median(surplus)) < 0.3
+
+
 def test_no_ascent_ends_below_its_start(random_beams):
     """With few measurements, the likelihood is far from quadratic."""
     scenario = dataclasses.replace(
