@@ -457,7 +457,9 @@ class Inside(NamedTuple):
             on_sphere = np.where(sides < 0, -on_sphere, on_sphere)
         mean, std = mean + by_range / total * (on_sphere - mean), 1 / np.sqrt(total)
         if (wide := self.wide).any():
-            mean[wide], std[wide] = select(self, wide)._along(chosen[:, wide], mean[wide])
+            # Far outside, perhaps behind the surface, the derivatives are not those in the region.
+            inside = np.clip(mean[wide], self.low_m[wide, 2:], self.high_m[wide, 2:])
+            mean[wide], std[wide] = select(self, wide)._along(chosen[:, wide], inside)
         return mean, std
 
     def _along(self, chosen: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

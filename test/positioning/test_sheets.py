@@ -169,3 +169,25 @@ def test_samples_follow_the_sphere_where_a_direction_is_unknown(cosine):
     heights = positions[0, :, 2]
     assert np.average(heights, weights=weights[0]) == pytest.approx(0, abs=0.1)
     assert np.average(heights**2, weights=weights[0]) == pytest.approx(1 / 3, rel=0.1)
+
+
+def test_a_maximum_behind_the_surface_does_not_move_the_samples_to_the_border():
+    """Signals of one band and a few subbands determine one of the directions, and no range."""
+    bounds = np.array([[5.5, -0.8, -1.6], [10.4, -0.8, 1.6]])
+    point = np.array([[5.6, -0.1415, 0.147]])
+    curvature = np.array([[[0.36, -12.7, 0.05], [-12.7, 468.0, -1.7], [0.05, -1.7, 0.25]]])
+    gradient = np.array([[-0.6, 18.6, -0.05]])
+    gaussian = Inside.of(point, gradient, curvature, bounds)
+    positions, log_ratio = gaussian.sample(NORMAL)
+    log_weights = (gaussian.logarithm(positions) + log_ratio)[0]
+    weights = np.exp(log_weights - log_weights.max())
+    reference = grid(bounds)
+    exact = np.exp(gaussian.logarithm(reference[None])[0])
+    for axis in (0, 2):
+        expected = np.average(reference[:, axis], weights=exact)
+        spread = np.sqrt(np.average((reference[:, axis] - expected)**2, weights=exact))
+        found = np.average(positions[0, :, axis], weights=weights)
+        assert found == pytest.approx(expected, abs=0.1 * spread)
+        assert np.sqrt(np.average((positions[0, :, axis] - found)**2, weights=weights)
+                       ) == pytest.approx(spread, rel=0.1)
+    assert weights.sum()**2 / (weights**2).sum() > 0.5 * len(weights)
