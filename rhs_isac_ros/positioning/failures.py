@@ -179,7 +179,8 @@ class FailedElements:
         keys = sorted((key for key in values if values[key] >= best - _MARGIN),
                       key=lambda key: -values[key])
         keys = keys[:max(_HYPOTHESES, n_sufficient([values[key] for key in keys], _LEFT_OUT))]
-        sets = list(dict.fromkeys(failed for failed, _ in keys))
+        # Predictions favour sets that imitate the signals, so no failure is always tried.
+        sets = list(dict.fromkeys([(), *(failed for failed, _ in keys)]))
         conditionals = [self._model.failed_set(failed) for failed in sets]
         parts = []
         for number, failed in enumerate(sets):

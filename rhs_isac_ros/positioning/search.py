@@ -455,12 +455,16 @@ def _best_towards(starts: np.ndarray, best: np.ndarray, limits: np.ndarray, boun
 
 
 def predict(local: Local, likelihood: Likelihood) -> np.ndarray:
-    """Predict the marginal log-likelihood after a Gauss-Newton step, float64 [M]."""
+    """Predict the marginal log-likelihood after a Gauss-Newton step, float64 [M].
+
+    Far from a fit, the observed slope along a gain is steeper than the expected curvature allows.
+    No step removes more than the residual.
+    """
     marginal, limits = marginalise(local.information, local.gradient), _limits(likelihood)
     step = step_to_maximum(marginal.information, marginal.gradient)
     whole = _with_parameters(
         marginal, np.clip(step, -limits, limits), likelihood.nuisance)
-    return local.value + marginal.log_volume + _rise(local, whole)
+    return local.value + marginal.log_volume + np.minimum(_rise(local, whole), local.residual)
 
 
 def _limits(likelihood: Likelihood) -> np.ndarray:

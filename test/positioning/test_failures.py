@@ -357,3 +357,20 @@ def test_signals_that_agree_with_hundreds_of_sets_and_places_determine_no_positi
     squares = np.sum(errors * np.linalg.solve(covariance, errors[..., None])[..., 0], axis=1)
     assert len(squares) >= 9
     assert np.mean(squares) < 3
+
+
+def test_a_gain_does_not_make_failures_of_an_intact_surface_probable(random_beams):
+    """Far from a fit, the slope along a gain is steeper than its expected curvature allows."""
+    scenario = Scenario(
+        center_frequencies_hz=(1.8e9, 2.1e9), n_subbands=10, n_frames=1, elements_per_side=(11, 5),
+        element_interval_wavelengths=0.3, multipath_to_los_db=-20.0, noise_psd_dbm_hz=-142.0,
+        roi_center_m=(23.0, 18.0, -3.0), roi_size_m=(3.5, 11.0, 14.0), user_gain_std_db=0.6,
+        failed_element_share=0.006)
+    codebook = random_beams(scenario, np.random.default_rng(0))
+    intact = dataclasses.replace(scenario, failed_element_share=0.0)
+    positions, received = System(intact, codebook).pairs(6, 0)
+    estimate = make_estimator('bayes', scenario, codebook).estimate(received)
+    errors = estimate.mean - positions
+    squares = np.sum(errors * np.linalg.solve(
+        estimate.covariance, errors[..., None])[..., 0], axis=1)
+    assert (squares < 16).all()
