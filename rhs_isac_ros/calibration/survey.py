@@ -309,8 +309,10 @@ def _in_sight(fit: _Fit, without: np.ndarray) -> np.ndarray:
     level_std_db = _level_std_db(fit.energies[seen], fit.weights[seen], n_measurements)
     prior = min(fit.model.scenario.blocked_probability or _BLOCKED_PROBABILITY, _MAX_BLOCKED)
     log_odds = (np.log(1 / prior - 1)
-                + gaussian.log_evidence_of_level(fit.energies, n_measurements, level_std_db)
-                - gaussian.log_evidence_of_level(without, n_measurements, gaussian.BLOCKED_STD_DB))
+                + gaussian.log_evidence_of_level(
+                    fit.energies[:, None], n_measurements, level_std_db)
+                - gaussian.log_evidence_of_level(
+                    without[:, None], n_measurements, gaussian.BLOCKED_STD_DB))
     return np.asarray(log_odds > 0)
 
 

@@ -99,18 +99,22 @@ def energy_limit(n: int, probability: float = FALSE_ALARM) -> float:
     return float(gammainccinv(n, probability))
 
 
-def log_evidence_of_level(energy: np.ndarray, n: int, std_db: float, median_db: float = 0.0
-                          ) -> np.ndarray:
+def log_evidence_of_level(
+        energies: np.ndarray, counts: int | np.ndarray, std_db: float, median_db: float = 0.0,
+        noise: float | np.ndarray = 0.0) -> np.ndarray:
     """Average the likelihood of Gaussian numbers over their level, a log-normal power.
 
-    `energy`, float64 [N], is the energy of n complex numbers relative to their variance at 0 dB.
-    Returns the logarithm of the average, float64 [N], relative to the likelihood of zeros at 0 dB.
+    `energies`, float64 [N, K], are those of K groups of complex numbers relative to the variance
+    of a number at 0 dB, and `counts` are the sizes of the groups. `noise` is the share of this
+    variance that does not depend on the level. Returns the logarithm of the average, float64 [N],
+    relative to the likelihood of zeros at 0 dB.
     """
-    std = POWER_NEPERS_PER_DB * std_db
+    std, n = POWER_NEPERS_PER_DB * std_db, np.broadcast_to(counts, energies.shape[1]).sum()
     # As a function of the level, the likelihood has a width of n**-0.5, which the grid resolves.
     normal = np.linspace(-4, 4, 2 * int(np.ceil(4 * std * np.sqrt(n))) + 61)
     level, prior = POWER_NEPERS_PER_DB * median_db + std * normal, -normal**2 / 2
-    exponents = -energy[:, None] * np.exp(-level) - n * level + prior
+    power = noise + (1 - noise) * np.exp(level)[:, None]
+    exponents = prior - energies @ (1 / power).T - (counts * np.log(power)).sum(axis=1)
     return mixture_weights(exponents)[1] - mixture_weights(prior)[1]
 
 
@@ -126,7 +130,7 @@ class UnknownLevel:
         self._log_energies = np.log(n) + np.arange(*_LOG_ENERGIES)
         energies = np.exp(self._log_energies)
         self._gains = np.zeros(len(energies)) if self.is_known else (
-            log_evidence_of_level(energies, n, level_db[1], level_db[0]) + energies)
+            log_evidence_of_level(energies[:, None], n, level_db[1], level_db[0]) + energies)
 
     def gain(self, energy: np.ndarray) -> np.ndarray:
         """Return logs of averages relative to likelihoods at 0 dB, for residual energies [...]."""

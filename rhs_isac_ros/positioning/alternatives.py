@@ -16,11 +16,12 @@ alternative, compared with such a user alone, is within the limit of the alterna
 import copy
 import math
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from rhs_isac_ros.model import MeasurementModel, Scenario, gaussian
+from rhs_isac_ros.model.arrays import adjoint, multiply_rows
 from rhs_isac_ros.model.constants import NEPERS_PER_DB
 from rhs_isac_ros.positioning.dispersed import ONE_STATE, SurfaceState
 from rhs_isac_ros.positioning.likelihood import Likelihood, Signals
@@ -67,21 +68,22 @@ class Blocked:
 
     name, reason, limit, strength = 'blocked', 'blocked', BLOCKED_LIMIT, 0.0
 
-    def __init__(self, scenario: Scenario, n_measurements: int,
+    def __init__(self, scenario: Scenario, model: MeasurementModel,
                  states: Sequence[SurfaceState] = ONE_STATE) -> None:
-        self._n, self._states = n_measurements, states
+        self._full = model.full if isinstance(model, ProjectedModel) else model
+        self._states = [_Separated.of(self._full, state) for state in states]
         self.log_odds = log_odds_of(scenario.blocked_probability)
         self._median_db, self._std_db = scenario.multipath_level_db
 
     def log_evidence_of(self, whitened: np.ndarray, aligned: np.ndarray, prior: NuisancePrior
                         ) -> np.ndarray:
-        """Compute log evidences from the energies of the signals; see `Outside`."""
+        """Compute log evidences with the level integrated out; see `Outside`."""
         # The gain of the user is part of the level.
         gain_db = min(prior.gain_std / NEPERS_PER_DB, _UNKNOWN_GAIN_DB)
         std_db = math.hypot(gaussian.BLOCKED_STD_DB, self._std_db, gain_db)
         blocked = np.logaddexp.reduce([
             state.offset + gaussian.log_evidence_of_level(
-                state.energy(whitened), self._n, std_db, self._median_db)
+                state.energies(whitened), 1, std_db, self._median_db, state.noise)
             for state in self._states])
         if prior.gain_std:
             # Relative to the density of an unknown gain that positions assume.
@@ -90,11 +92,11 @@ class Blocked:
 
     def seen(self, model: MeasurementModel, received: np.ndarray, whitened: np.ndarray
              ) -> np.ndarray:
-        """Return the whitened signals, of which only the energy matters."""
-        return whitened
+        """Return the whitened signals of N shots before they are projected."""
+        return whitened if self._full is model else self._full.whiten(received)
 
     def noise_ratio(self, whitened: np.ndarray, likelihood: Likelihood) -> float:
-        """Return 0: the level also scales the noise; see `Outside`."""
+        """Return 0: the level does not scale the noise; see `Outside`."""
         return 0.0
 
     def places(self, whitened: np.ndarray, prior: NuisancePrior
@@ -109,8 +111,34 @@ class Blocked:
 
     def explain(self, whitened: np.ndarray, max_residual: float) -> bool:
         """Return whether a plausible level explains signals up to this residual energy."""
-        energy = float(np.sum(np.abs(whitened)**2))
-        return energy <= max_residual * 10**(_LEVEL_REACH * gaussian.BLOCKED_STD_DB / 10)
+        level = 10**(_LEVEL_REACH * gaussian.BLOCKED_STD_DB / 10)
+        return any(np.sum(state.energies(whitened[None]) / (
+            state.noise + (1 - state.noise) * level)) <= max_residual for state in self._states)
+
+
+class _Separated(NamedTuple):
+    """A state of the surface, with whitened signals in which multipath and noise are diagonal."""
+
+    offset: float  # That of `SurfaceState`.
+    operator: np.ndarray  # Yields these signals of unit variance, complex128 [N_B, n, n].
+    noise: np.ndarray  # Share of thermal noise in their variances, float64 [N_B n].
+
+    @classmethod
+    def of(cls, model: MeasurementModel, state: SurfaceState) -> '_Separated':
+        """Separate multipath and noise in the whitened signals of a model."""
+        whitener = model.combined_whitener
+        if state.operator is not None:
+            whitener = adjoint(np.linalg.cholesky(state.operator)) @ whitener
+        shares, vectors = np.linalg.eigh(
+            model.scenario.noise_power_w * whitener @ adjoint(whitener))
+        operator = adjoint(vectors) @ whitener @ model.combined_root
+        # Rounding may bring a share beyond its ends.
+        return cls(state.offset, operator, np.clip(shares, 0.0, 1.0).ravel())
+
+    def energies(self, whitened: np.ndarray) -> np.ndarray:
+        """Return energies of the signals of N shots, float64 [N, N_B n]."""
+        return np.asarray(np.abs(multiply_rows(self.operator, whitened))**2).reshape(
+            len(whitened), -1)
 
 
 class Outside:

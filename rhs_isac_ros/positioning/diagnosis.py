@@ -111,8 +111,8 @@ def misfit_log_ratio(residual: float, n: int, level_db: tuple[float, float] = (0
     It is relative to the best position, with the median and standard deviation `level_db` of the
     multipath. Without a position, the residual has an unknown level.
     """
-    median_db, std_db = level_db
-    in_sight, misfit = (gaussian.log_evidence_of_level(np.array([residual]), n, one_db, median_db)
+    (median_db, std_db), energy = level_db, np.array([[residual]])
+    in_sight, misfit = (gaussian.log_evidence_of_level(energy, n, one_db, median_db)
                         for one_db in (std_db, math.hypot(std_db, gaussian.BLOCKED_STD_DB)))
     return float((misfit - in_sight)[0])
 

@@ -128,7 +128,7 @@ class SearchEstimator(abc.ABC):
         self._averaging = OneState(likelihood, EXACT_MARGIN)
         # What distinguishes users without a direct path, and their parameters.
         self._blocked = [Blocked(
-            scenario, n_measurements,
+            scenario, likelihood.model,
             self._averaging.states(MeasurementModel.covariance_in_shadow))
         ] if scenario.blocked_probability else []
         self._shadow = Alignment(likelihood, np.zeros_like(likelihood.model.combined_root))
@@ -334,16 +334,15 @@ class SearchEstimator(abc.ABC):
             aligned = scope.alignment.values_of_each(signals.received)
             whitened = self._likelihood.whitened(aligned, signals)
             fits = self._fits(scope, signals, aligned, whitened, draws)
-            seen = whitened
-            for alternative in scope.alternatives:
-                seen = alternative.seen(self._likelihood.model, signals.received, seen)
+            seen = [one.seen(self._likelihood.model, signals.received, whitened)
+                    for one in scope.alternatives]
             ratios, outside = self._log_ratios(
                 scope.alternatives, signals, seen, aligned, [one.fit for one in fits])
-            for n, (row, searched, one, values) in enumerate(zip(
-                    usable, fits, seen, aligned, strict=True)):
+            for n, (row, searched) in enumerate(zip(usable, fits, strict=True)):
                 log_ratios = {name: float(ratio[n]) for name, ratio in ratios.items()}
                 estimate = self._judge(
-                    scope.alternatives, log_ratios, searched, select(signals, [n]), one, values)
+                    scope.alternatives, log_ratios, searched, select(signals, [n]), whitened[n],
+                    [each[n] for each in seen], aligned[n])
                 found[row] = _Found(self, estimate, log_ratios, *searched, outside[n])
         return [found[row] for row in range(len(reasons))]
 
@@ -406,8 +405,8 @@ class SearchEstimator(abc.ABC):
         return Samples.of(
             positions, log_weights, modes.shots, (2 * n_moving + 2) * (n_moving > 0))
 
-    def _log_ratios(self, alternatives: Sequence[Alternative], signals: Signals, seen: np.ndarray,
-                    aligned: np.ndarray, fits: Sequence[Fit]
+    def _log_ratios(self, alternatives: Sequence[Alternative], signals: Signals,
+                    seen: Sequence[np.ndarray], aligned: np.ndarray, fits: Sequence[Fit]
                     ) -> tuple[dict[str, np.ndarray], list[Callable[[], Sheets] | None]]:
         """Return logarithms of the likelihoods of alternatives relative to the fits, [N] each.
 
@@ -421,11 +420,11 @@ class SearchEstimator(abc.ABC):
             for fit in fits]).T
         shadow = self._shadow.values_of_each(signals.received, aligned)
         in_sight = averaged + self._unknown_level.gain(residuals)
-        for one in alternatives:
-            ratios, values, seen = log_ratios_of(
-                one, self._likelihood, signals, seen, aligned, shadow, in_sight)
+        for one, projected in zip(alternatives, seen, strict=True):
+            ratios, values, turned = log_ratios_of(
+                one, self._likelihood, signals, projected, aligned, shadow, in_sight)
             for n in np.flatnonzero((gains > 0) & (one.log_odds + ratios > _CLEAR)):
-                points, parameters, share, level = one.places(seen[n], prior)
+                points, parameters, share, level = one.places(turned[n], prior)
                 gain = self._refinement.gain(points, parameters + values[n], Signals(*(
                     each / level for each in select(signals, [n]))))
                 # Sets of failed elements are not searched at the other places.
@@ -433,18 +432,18 @@ class SearchEstimator(abc.ABC):
                 ratios[n] += np.logaddexp(np.log(others), np.log(share) + gain) - gains[n]
             found[one.name] = ratios
             if isinstance(one, Outside):
-                outside = [functools.partial(one.sheets, each, prior) for each in seen]
+                outside = [functools.partial(one.sheets, each, prior) for each in turned]
         return found, outside
 
     def _judge(self, alternatives: Sequence[Alternative], log_ratios: Mapping[str, float],
-               searched: '_Searched', signals: Signals, whitened: np.ndarray, aligned: np.ndarray
-               ) -> Estimate:
+               searched: '_Searched', signals: Signals, whitened: np.ndarray,
+               seen: Sequence[np.ndarray], aligned: np.ndarray) -> Estimate:
         """Return the position of one shot, or the reason why there is none."""
         fit = searched.fit
         probabilities, _ = mixture_weights(np.array([0.0, *(
             one.log_odds + log_ratios[one.name] for one in alternatives)]))
-        weights = self._likelihood.weights_at(np.array([fit.gain]))[0]
-        reason = self._reason(alternatives, whitened * np.exp(-fit.gain) * weights,
+        factor = np.exp(-fit.gain) * self._likelihood.weights_at(np.array([fit.gain]))[0]
+        reason = self._reason(alternatives, whitened * factor, [each * factor for each in seen],
                               fit.residual, probabilities)
         if self._movement and not reason:
             reason = self._movement.reason(
@@ -472,19 +471,19 @@ class SearchEstimator(abc.ABC):
         largest = max(self._prior_m2 / float(fit.covariance[:3, :3].trace()), 1.0)
         return float(min(relative**self._level_share, largest))
 
-    def _reason(self, alternatives: Sequence[Alternative], whitened: np.ndarray, residual: float,
-                probabilities: np.ndarray) -> str:
+    def _reason(self, alternatives: Sequence[Alternative], whitened: np.ndarray,
+                seen: Sequence[np.ndarray], residual: float, probabilities: np.ndarray) -> str:
         """Return the reason why there is no fix, or '' if there is one."""
         # If no position in the region explains the signals, an alternative is the reason only if
         # it explains them.
         unexplained = self._test.residual_test(residual) or self._test.weak_test(
             float(np.sum(np.abs(whitened)**2)), residual)
         in_sight, *others = probabilities.tolist()
-        for probability, one in sorted(
-                zip(others, alternatives, strict=True),
-                key=lambda pair: -pair[0] / pair[1].limit):
+        for probability, one, signals in sorted(
+                zip(others, alternatives, seen, strict=True),
+                key=lambda each: -each[0] / each[1].limit):
             reason = rejection(one, probability, in_sight)
-            if reason and (not unexplained or one.explain(whitened, self._test.max_residual)):
+            if reason and (not unexplained or one.explain(signals, self._test.max_residual)):
                 return reason
         return unexplained
 

@@ -95,7 +95,7 @@ def test_the_evidence_of_a_level_is_the_average_over_it(median_db):
         -energy[:, None] * np.exp(-level) - n * level + norm(median_db, std_db).logpdf(db),
         axis=1) + np.log(db[1] - db[0])
     np.testing.assert_allclose(
-        gaussian.log_evidence_of_level(energy, n, std_db, median_db), expected, atol=0.05)
+        gaussian.log_evidence_of_level(energy[:, None], n, std_db, median_db), expected, atol=0.05)
 
 
 def test_bessel_function():

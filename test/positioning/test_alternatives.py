@@ -20,6 +20,7 @@ from rhs_isac_ros.positioning import outside as outside_table
 from rhs_isac_ros.positioning.alternatives import (
     BLOCKED_LIMIT,
     LIMIT,
+    Blocked,
     Outside,
     log_ratios_of,
 )
@@ -194,6 +195,29 @@ def test_blocked_users_have_no_errors_of_the_direct_path(failing):
         log_det = np.linalg.slogdet(covariance)[1].sum()
         assert state.offset == pytest.approx(
             binom.logpmf(n, 25, 0.04) + likelihood.log_det - log_det, abs=1e-3)
+
+
+@pytest.mark.parametrize('multipath_db', [-15.0, 0.0])
+def test_the_level_of_a_blocked_user_does_not_scale_the_noise(failing, multipath_db):
+    likelihood, _, signals = failing
+    scenario = dataclasses.replace(likelihood.scenario, multipath_to_los_db=multipath_db)
+    likelihood = Likelihood(System(scenario, likelihood.codebook))
+    states = OneState(likelihood).states(MeasurementModel.covariance_in_shadow)
+    blocked = Blocked(scenario, likelihood.model, states)
+    normal, whitened = np.linspace(-5, 5, 401), likelihood.model.whiten(signals)
+    noise, log_densities = scenario.noise_power_w * np.eye(signals.shape[-1]), []
+    root = likelihood.model.combined_root
+    for state in states:
+        covariance = root @ np.linalg.inv(state.operator) @ adjoint(root)
+        multipath = 10**normal[:, None, None, None] * (covariance - noise) + noise
+        energies = np.sum((signals.conj() * np.linalg.solve(
+            multipath, signals[..., None])[..., 0]).real, axis=(1, 2))
+        log_densities.append(
+            binom.logpmf(len(log_densities), 25, 0.04) - energies
+            + likelihood.log_det - np.linalg.slogdet(multipath)[1].sum(axis=1))
+    expected = logsumexp(log_densities + norm.logpdf(normal)) + np.log(normal[1] - normal[0])
+    (found,) = blocked.log_evidence_of(whitened, np.zeros((1, 0)), likelihood.nuisance)
+    assert found == pytest.approx(expected, abs=0.01)
 
 
 def test_templates_have_the_covariance_of_their_state(failing):

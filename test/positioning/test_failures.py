@@ -245,7 +245,7 @@ def test_users_elsewhere_have_the_evidence_of_the_true_set(
     received = 10**(level_db / 20) * surface.sample(
         to_positions(point), np.random.default_rng(3))
     monkeypatch.setattr(outside_table, '_TEMPLATES', 1000)
-    elsewhere = (Blocked(SCENARIO, received.size) if level_db
+    elsewhere = (Blocked(SCENARIO, likelihood.model) if level_db
                  else Outside(SCENARIO, tabulate_outside(likelihood.model)))
     points, values, share, level = elsewhere.places(
         likelihood.signals(received).whitened[0], likelihood.nuisance)
