@@ -7,7 +7,7 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message, serialize_message
 
 from rhs_isac_ros.protocol import messages as m
-from rhs_isac_ros.ros import convert
+from rhs_isac_ros.ros import convert, topics
 
 
 def position_estimate(user=1, position=(8.0, 2.5, 0.1), **given):
@@ -19,8 +19,9 @@ def position_estimate(user=1, position=(8.0, 2.5, 0.1), **given):
 def to_ros(message, stamp=None, identity=None):
     """Convert a dataclass to a ROS message; the identity is as in `convert.to_bytes`."""
     stamp_ns = 10**9 * stamp.sec + stamp.nanosec if stamp is not None else 0
-    return deserialize_message(
-        convert.to_bytes(message, stamp_ns, identity), convert.ros_type(type(message)))
+    frame = topics.MAP_FRAME if isinstance(message, m.POSITIONS) else topics.RHS_FRAME
+    return deserialize_message(convert.to_bytes(
+        message, stamp_ns, identity, frame), convert.ros_type(type(message)))
 
 
 def from_ros(kind, message):

@@ -34,6 +34,7 @@ from rhs_isac_ros.ros.convert import to_ros
 from rhs_isac_ros.ros.node_surface import NodeSurface
 from rhs_isac_ros.ros.run import entry
 from rhs_isac_ros.ros.topics import RHS_FRAME, Frame
+from rhs_isac_ros.support.frame_watch import FrameWatch
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -169,7 +170,7 @@ class VisualizerNode(Node):
         self._scenario = NodeSurface.of(values, self.get_namespace()).scenario
         self._frame = Frame.of(self, values)
         self._forget_s, self._period_s = values.forget_s, values.period_s
-        self._scene = SceneState()
+        self._scene, self._frames = SceneState(), FrameWatch(self._frame.name)
         # The latest beam and its marker, because a beam pattern is slow to compute.
         self._drawn: tuple[m.Beam, Marker] | None = None
         # A marker that is no longer published disappears after three periods.
@@ -187,12 +188,15 @@ class VisualizerNode(Node):
                     transforms=[transform(self._frame, self._frame.surface, pose.origin,
                                           self.get_clock().now().to_msg(), pose.unit_quaternion)]))
         endpoints.subscribe_messages(self, SCENE_RECEIVES, self._scenario, self._on_message,
-                                     on_foreign=lambda message: None)
+                                     on_foreign=lambda message: None, on_frame=self._note_frame)
         endpoints.steady_timer(self, values.period_s, self._show)
         endpoints.log(
             self, 'serving: markers, paths' + (
                 ' and transforms' if TFMessage
                 else '; no transforms, because tf2_msgs is not installed'))
+
+    def _note_frame(self, topic: str, frame: str) -> None:
+        self._frames.add(topic, frame, time.monotonic())
 
     def _on_message(self, message: m.Message, arrived_s: float) -> None:
         self._scene.add(message, arrived_s)
@@ -208,7 +212,10 @@ class VisualizerNode(Node):
 
         Return the time until the next call [s], which is longer if nobody receives them.
         """
-        for number in self._scene.discard_stale(time.monotonic() - self._forget_s):
+        now_s = time.monotonic()
+        problem = self._frames.update(now_s)
+        endpoints.journal(self).update({'frame': problem} if problem else {})
+        for number in self._scene.discard_stale(now_s - self._forget_s):
             self._paths.remove(number)
         stamp = self.get_clock().now().to_msg()
         for number, user in self._scene.users.items():

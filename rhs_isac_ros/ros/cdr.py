@@ -111,7 +111,15 @@ TYPES = {
 HEADER = b'\0\1\0\0'
 _NANOSECONDS = 10**9
 _NONE = np.empty(0)
+# Position of the frame in a message, which follows the stamp.
+_FRAME = len(HEADER) + 8
 _SIZES = {'?': 1, 'B': 1, 'i': 4, 'I': 4, 'Q': 8, 'd': 8}
+
+
+def frame_of(data: bytes) -> str:
+    """Return the frame in the header of a message that has been decoded."""
+    size, = struct.unpack_from('<I', data, _FRAME)
+    return data[_FRAME + 4:_FRAME + 4 + size].removesuffix(b'\0').decode()
 
 
 class _Run(NamedTuple):

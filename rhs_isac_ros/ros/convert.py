@@ -86,6 +86,11 @@ def from_bytes(kind: type[_MessageT], serialized: bytes) -> _MessageT:
     return _CODECS[kind].decode(serialized)
 
 
+def frame_of(serialized: bytes) -> str:
+    """Return the frame of a message that `from_bytes` has converted; empty if it has none."""
+    return cdr.frame_of(serialized)
+
+
 def extension(own: type, n_fields: int) -> Callable[[bytes], bytes] | None:
     """Return a function that adds the last fields to serialized messages of an earlier version.
 

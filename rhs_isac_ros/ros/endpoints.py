@@ -309,6 +309,7 @@ def subscribe_messages(
         on_error: Callable[[m.MessageError], None] | None = None, *,
         on_foreign: Callable[[m.Message], None] | None = None,
         on_arrival: Callable[[type[m.Message]], None] = lambda kind: None,
+        on_frame: Callable[[str, str], None] | None = None,
         exchange: QoSProfile = EXCHANGE, prefix: str = '') -> None:
     """Subscribe to messages of the protocol; drop messages that are malformed or foreign.
 
@@ -324,6 +325,8 @@ def subscribe_messages(
         Called with messages of other scenarios; by default, they are errors.
     on_arrival
         Called with the class of each message before decoding.
+    on_frame
+        Called with the topic and the frame of each message that contains positions.
     exchange
         Quality of service, as in `profile_for`.
     prefix
@@ -344,6 +347,9 @@ def subscribe_messages(
         except m.MessageError as error:
             (on_error or functools.partial(log_dropped, node))(error)
             return
+        if on_frame and kind in m.POSITIONS:
+            on_frame(node.resolve_topic_name(prefix + topics.NAMES[kind]),
+                     convert.frame_of(serialized))
         on_message(message, arrived_s(info))
     for kind in kinds:
         subscribe(node, convert.ros_type(kind), prefix + topics.NAMES[kind],

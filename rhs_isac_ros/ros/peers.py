@@ -21,6 +21,7 @@ from rhs_isac_ros.protocol.presences import PERIOD_S, SLOW_PERIOD_S, Presence, P
 from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.ros.roster import MEMBERS
 from rhs_isac_ros.support.clock_watch import ClockWatch
+from rhs_isac_ros.support.frame_watch import FrameWatch
 
 # Poll period while roles appear or nodes are in conflict, poll period otherwise, and of a node
 # without work that nobody observes [s].
@@ -58,13 +59,15 @@ class Peers:
         Id of the library of codebooks; empty for a role that uses none.
     observe
         Called after each poll; returns whether an observer expects a poll every second.
+    frame
+        Frame of the positions that the node expects and publishes; empty if it has none.
     """
 
     def __init__(
             self, node: Node, role: str, instance: int, scenario: Scenario,
             on_missing: Callable[[tuple[str, ...]], None],
             on_rival: Callable[[bool], None], site_prefix: str = '', library_id: str = '',
-            observe: Callable[[], bool] = lambda: False) -> None:
+            observe: Callable[[], bool] = lambda: False, frame: str = '') -> None:
         self._node, self._on_missing, self._on_rival = node, on_missing, on_rival
         self._observe, self._work_end_s, self._period_s = observe, 0.0, PERIOD_S
         of_site = MEMBERS[role].requires_of_site if site_prefix else ()
@@ -75,6 +78,7 @@ class Peers:
         # The newest instance of each role of interest at the last poll, and the newest one ever.
         self._newest, self._latest = dict.fromkeys((role, *self._needed), 0), 0
         self._clock, self._mismatches = ClockWatch(), Mismatches(node)
+        self._frames = FrameWatch(frame)
         self._conflicts: dict[str, str] = {}
         # Before the first announcement, which other nodes compare with their own.
         self._examine_clock()
@@ -109,6 +113,10 @@ class Peers:
         if not had_work:
             self._changed.set()
 
+    def note_frame(self, topic: str, frame: str) -> None:
+        """Compare the frame of a received position with those of others."""
+        self._frames.add(topic, frame, time.monotonic())
+
     def close(self) -> None:
         """Announce that the node gives up its role; called before the node is destroyed."""
         self._closed = True
@@ -138,9 +146,10 @@ class Peers:
             # Nothing that a new node causes has been logged before.
             endpoints.journal(self._node).renew()
             self._latest = latest
-        clock_problem = self._examine_clock()
-        self._conflicts = self._presences.conflicts() | self._mismatches.update() | (
-            {'conflict.time': clock_problem} if clock_problem else {})
+        problems = {'conflict.time': self._examine_clock(),
+                    'conflict.frame': self._frames.update(time.monotonic())}
+        self._conflicts = self._presences.conflicts() | self._mismatches.update() | {
+            key: problem for key, problem in problems.items() if problem}
         endpoints.journal(self._node).update(self._conflicts)
         if self._newest[self._role] != before[self._role]:
             self._on_rival(self._presences.stands_by)

@@ -190,7 +190,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             self, self._executable, self.instance, self.scenario, self._on_missing,
             self._on_rival, self.surface.site_prefix,
             self.library.id if hasattr(self.values, 'library_file') else '',
-            make_reporter(self, self.report))
+            make_reporter(self, self.report),
+            self.frame.name if hasattr(self.values, 'frame_id') else '')
         self.endings.callback(self._peers.close)
         if subscribe and not needs_codebook:
             self.subscribe()
@@ -222,7 +223,8 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
             endpoints.subscribe_messages(
                 self, [kind], scenario, self._on_message, self._on_malformed,
                 on_foreign=functools.partial(self._on_foreign, scenario),
-                on_arrival=self._statistics.count_received, prefix=prefix)
+                on_arrival=self._statistics.count_received,
+                on_frame=self._peers.note_frame, prefix=prefix)
         self._peers.take_role()
 
     def report(self) -> Report:

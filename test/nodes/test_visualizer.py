@@ -78,6 +78,15 @@ def test_users_and_estimates_are_shown_at_their_positions(bench, probe, shown):
     bench.until(lambda: shown['truth', 1].pose.position.x == 9.5, 'the new position')
 
 
+def test_positions_in_another_frame_are_reported(bench, probe, shown, capfd):
+    estimate = to_ros(position_estimate())
+    estimate.header.frame_id = 'odom'
+    bench.publisher(probe, m.PositionEstimate).publish(estimate)
+    bench.until(lambda: ('estimate', 1) in shown, 'the user')
+    assert capfd.readouterr().err.count(
+        "positions in the frames 'map' (this node), 'odom' (/position_estimate)") == 1
+
+
 def test_rviz_lists_the_namespaces_of_all_markers(bench, probe, shown, small):
     """So that each can be switched off."""
     layout = yaml.safe_load((ROOT / 'config/rviz/network.rviz').read_text(encoding='utf-8'))

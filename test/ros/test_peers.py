@@ -14,7 +14,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.topic_endpoint_info import TopicEndpointTypeEnum
-from ros_messages import parameters, to_ros
+from ros_messages import parameters, position_estimate, to_ros
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 
@@ -29,7 +29,7 @@ from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES, SENSOR
 from rhs_isac_ros.ros.peers import Mismatches, Peers
 from rhs_isac_ros.ros.role_node import CodebookClient, RoleNode
 from rhs_isac_ros.ros.roster import ROSTER
-from rhs_isac_ros.support import clock_watch
+from rhs_isac_ros.support import clock_watch, frame_watch
 
 TYPES = {name: convert.ros_type(kind) for kind, name in topics.NAMES.items()}
 ROLES = [name for name, member in ROSTER.items() if member.needed]
@@ -197,6 +197,31 @@ def test_nodes_in_different_times_report_each_other(bench, add_channel, announce
     assert '/optimizer: use_sim_time true, expected' in node.report().summary
     bench.until(lambda: '/channel: use_sim_time false, expected' in capfd.readouterr().err,
                 'the report of the other node')
+
+
+# Frames
+
+def test_positions_in_another_frame_are_reported_while_they_arrive(
+        bench, probe, monkeypatch, capfd):
+    monkeypatch.setattr(frame_watch, 'WINDOW_S', 0.5)
+    node, message = bench.add_role('bs'), to_ros(position_estimate())
+    publisher = bench.publisher(probe, m.PositionEstimate)
+    assert message.header.frame_id == 'map'
+    publisher.publish(message)
+    message.header.frame_id = ''
+    publisher.publish(message)
+    bench.until(lambda: node.report().details.get('received.PositionEstimate') == '2')
+    node._peers._poll()
+    assert 'conflict.frame' not in node.report().details
+    message.header.frame_id = 'odom'
+    publisher.publish(message)
+    bench.until(lambda: 'conflict.frame' in node.report().details, 'the report')
+    text = "positions in the frames 'map' (this node), 'odom' (/position_estimate)"
+    assert text in node.report().summary
+    bench.until(lambda: 'conflict.frame' not in node.report().details, 'its end')
+    log = capfd.readouterr().err
+    assert log.count(text) == 2
+    assert f'no longer: {text}' in log
 
 
 # Quality of service
