@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import itertools
 import json
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -236,6 +237,8 @@ class Peers:
 _FOREIGN = ('/rosout', '/parameter_events')
 # Placeholders of the middleware for the name of a node, which may arrive after its endpoints.
 UNNAMED = ('_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_')
+# Begin of a reason why qualities of service are incompatible.
+_SEVERITY = re.compile(r'\b(ERROR|WARNING): ')
 # Time after which an endpoint without a name belongs to no node of ROS [s].
 _NAMING_S = 3.0
 
@@ -301,6 +304,7 @@ class Mismatches:
                     publisher.qos_profile, subscription.qos_profile)
                 if compatibility != QoSCompatibility.ERROR:
                     continue
-            reason = reason.removeprefix('ERROR: ').rstrip(';. ')
+            # There may be several reasons.
+            reason = _SEVERITY.sub('', reason).rstrip(';. ').replace(';', '; ')
             yield (f'conflict.{kind}.{topic.lstrip("/")}.{name.lstrip("/").replace(" ", "_")}',
                    f'{topic}: no messages between this node and {name}: {reason}')

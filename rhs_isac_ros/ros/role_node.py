@@ -35,6 +35,9 @@ _NAMES = list(CODEBOOK)
 # Time without a response after which a request is repeated [s]: a killed optimizer does not
 # respond, but remains in the ROS graph for some time.
 _RETRY_S = 0.25
+# Time after which an announced codebook that the optimizer does not hold is reported, because an
+# optimizer that starts or ends may differ for a moment; period of the requests from then on [s].
+_PATIENCE_S, _SLOW_RETRY_S = 3.0, 2.0
 
 
 class CodebookClient:
@@ -42,7 +45,9 @@ class CodebookClient:
 
     The latched topic announces the id of the codebook. The client requests the parameters until
     they contain the codebook with this id: while the optimizer restarts, a response may be missing
-    or contain an earlier codebook. `codebook_id` is the id of the latest codebook, or ''.
+    or contain an earlier codebook. If the difference lasts, another node announces a codebook, as
+    a player of a recording does, and the client reports it. `codebook_id` is the id of the latest
+    codebook, or ''.
     """
 
     def __init__(
@@ -54,21 +59,22 @@ class CodebookClient:
         self._client = endpoints.create_or_refuse(
             node, f'client of {name}', lambda: node.create_client(GetParameters, name))
         # Id of the announced codebook while it is requested.
-        self._announced_id = ''
+        self._announced_id, self._announced_s = '', 0.0
+        self._conflict = ''
         self.codebook_id = ''
         endpoints.subscribe(
             node, ros.Codebook, topics.CODEBOOK, self._on_announcement, endpoints.LATCHED)
         self._timer = endpoints.steady_timer(node, _RETRY_S, self._request)
 
     def _on_announcement(self, announcement: ros.Codebook) -> None:
-        self._announced_id = announcement.codebook_id
-        self._timer.reset()
+        if announcement.codebook_id != self._announced_id:
+            self._announced_id, self._announced_s = announcement.codebook_id, time.monotonic()
+            endpoints.set_period(self._timer, _RETRY_S)
         self._request()
 
     def _request(self) -> None:
         if self._announced_id in ('', self.codebook_id):
-            self._announced_id = ''
-            self._timer.cancel()
+            self._end()
         elif self._client and self._client.service_is_ready():
             future = self._client.call_async(GetParameters.Request(names=_NAMES))
             future.add_done_callback(self._on_response)
@@ -79,8 +85,35 @@ class CodebookClient:
             codebook = Codebook.from_parameters(dict(zip(
                 _NAMES, map(parameter_value_to_python, future.result().values), strict=True)))
             if codebook.id == self._announced_id:
-                self._announced_id = ''
+                self._end()
                 self._use(codebook)
+            elif self._announced_id and time.monotonic() > self._announced_s + _PATIENCE_S:
+                self._report(codebook.id)
+
+    def _end(self) -> None:
+        """End the requests."""
+        self._announced_id = ''
+        self._timer.cancel()
+        self._set_conflict('')
+
+    def _report(self, held_id: str) -> None:
+        """Report that the optimizer holds another codebook, unless the other node has gone."""
+        if self._node.count_publishers(self._node.resolve_topic_name(topics.CODEBOOK)) < 2:
+            self._end()
+            return
+        endpoints.set_period(self._timer, _SLOW_RETRY_S)
+        self._set_conflict(f'{topics.CODEBOOK}: another node announces {self._announced_id}, but '
+                           f'{topics.OPTIMIZER_NODE} holds {held_id}, which is used')
+
+    def _set_conflict(self, text: str) -> None:
+        before, self._conflict = self._conflict, text
+        if text != before:
+            endpoints.journal(self._node).state(
+                'announced', text or f'no longer: {before}', bool(text))
+
+    def conflicts(self) -> dict[str, str]:
+        """Return the codebook that the optimizer does not hold, if any, for the diagnostics."""
+        return {'conflict.codebook': self._conflict} if self._conflict else {}
 
     def _use(self, codebook: Codebook) -> None:
         try:
@@ -230,10 +263,12 @@ class RoleNode(ParameterizedNode, Generic[_RoleT]):
     def report(self) -> Report:
         """Return the diagnostics of the role, with the faults since the last report."""
         state = self.role.state
+        codebook = (self._codebook_client.conflicts() if MEMBERS[self._executable].has_codebook
+                    else {})
         return self._statistics.report(
             '' if state is None else state.value, self.role.counters,
             state in self.role.BLOCKED_STATES,
-            {**self.role.status(), **self._peers.conflicts(), **self.details()})
+            {**self.role.status(), **self._peers.conflicts(), **codebook, **self.details()})
 
     def details(self) -> Mapping[str, str]:
         """Return further values of the diagnostics; by default, there are none."""

@@ -1,6 +1,7 @@
 """Other nodes that are present, and endpoints that do not fit."""
 
 import contextlib
+import copy
 import threading
 import time
 import types
@@ -9,6 +10,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from node_bench import Bench
+from rclpy.duration import Duration
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -24,7 +26,7 @@ from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.protocol import messages as m
 from rhs_isac_ros.protocol import presences
 from rhs_isac_ros.protocol.role import Role
-from rhs_isac_ros.ros import convert, peers, topics
+from rhs_isac_ros.ros import convert, peers, role_node, topics
 from rhs_isac_ros.ros.endpoints import EXCHANGE, LATCHED, PRESENCES, SENSOR
 from rhs_isac_ros.ros.peers import Mismatches, Peers
 from rhs_isac_ros.ros.role_node import CodebookClient, RoleNode
@@ -228,10 +230,13 @@ def test_positions_in_another_frame_are_reported_while_they_arrive(
 
 def test_endpoints_with_incompatible_qos_are_named_once(bench, capfd):
     node, observer = bench.add_role('channel'), bench.add(Node, 'observer')
+    strict = copy.copy(LATCHED)
+    strict.deadline = Duration(seconds=1)
     observer.create_subscription(
-        TYPES['feed_signals'], 'feed_signals', lambda message: None, LATCHED)
+        TYPES['feed_signals'], 'feed_signals', lambda message: None, strict)
     observer.create_publisher(TYPES['pilot'], 'pilot', qos_profile_sensor_data)
-    reasons = {'feed_signals': 'Volatile publisher and transient local subscription',
+    reasons = {'feed_signals': 'Volatile publisher and transient local subscription; Subscription '
+               'deadline is less than publisher deadline',
                'pilot': 'Best effort publisher and reliable subscription'}
     keys = {f'conflict.qos.{topic}.observer' for topic in reasons}
     bench.until(lambda: keys <= node.report().details.keys(), 'the report')
@@ -432,6 +437,30 @@ def test_a_codebook_that_no_optimizer_holds_is_not_used(bench, probe, bench_file
     assert got == [first.id]
     optimizer.set_parameters_atomically(parameters(second.to_parameters()))
     bench.until(lambda: got == [first.id, second.id], 'the next codebook')
+
+
+def test_a_codebook_that_another_node_announces_is_reported_until_the_node_has_gone(
+        bench, bench_files, small, monkeypatch, capfd):
+    monkeypatch.setattr(role_node, '_PATIENCE_S', 0.3)
+    monkeypatch.setattr(role_node, '_SLOW_RETRY_S', 0.1)
+    first, second = (Codebook.load(bench_files / f'{name}.yaml') for name in ('first', 'second'))
+    files = {'scenario_file': bench_files / 'scenario.yaml'}
+    bench.add_role('optimizer', values={**files, 'codebook_file': bench_files / 'first.yaml'})
+    node = bench.add_role('rhs_controller', values=files)
+    bench.until(lambda: node.report().details.get('codebook_id') == first.id, 'the codebook')
+    player = bench.add(Node, 'player')
+    codebooks = player.create_publisher(ros.Codebook, topics.CODEBOOK, LATCHED)
+    bench.until(codebooks.get_subscription_count, 'the subscription')
+    codebooks.publish(convert.to_bytes(convert.CodebookMessage.of(second), 0))
+    text = (f'codebook: another node announces {second.id}, but optimizer holds {first.id}, '
+            'which is used')
+    bench.until(lambda: text in node.report().summary, 'the report')
+    assert node.report().details['codebook_id'] == first.id
+    bench.remove(player)
+    bench.until(lambda: 'conflict.codebook' not in node.report().details, 'its end')
+    log = capfd.readouterr().err
+    assert log.count(text) == 2
+    assert f'no longer: {text}' in log
 
 
 def test_a_node_of_another_scenario_changes_nothing(bench, add_channel, monkeypatch):
