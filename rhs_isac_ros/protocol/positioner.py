@@ -38,6 +38,9 @@ from rhs_isac_ros.support.plugins import PluginError, calling
 from rhs_isac_ros.support.texts import MAX_LISTED, counted
 from rhs_isac_ros.system import System
 
+# Maximum number of tracks, each of which takes about 0.1 MB.
+_MAX_TRACKS = 512
+
 
 @dataclasses.dataclass
 class _Track:
@@ -56,21 +59,22 @@ class _Track:
         return received.sender == self.latest.sender and (
             received.cycle_id <= self.latest.cycle_id)
 
-    def may_continue(self, received: m.ReceivedSignals, now_s: float) -> bool:
-        """Return whether the user may be the same instance, and the clock has not been reset."""
-        return now_s >= self.time_s - MAX_GAP_S and m.same_instance(
-            received.user_instance, self.latest.user_instance)
+    def is_over(self, now_s: float) -> bool:
+        """Return whether the gap to signals is too long, or the clock has been reset."""
+        return abs(now_s - self.time_s) > MAX_GAP_S
 
 
 class Tracks:
     """One track for each user, derived from the received signals.
 
     A track ends after a gap of `MAX_GAP_S` or a reset of the clock, when another instance of the
-    user is located, or after `MAX_USERS` other users. Late signals neither use nor change a track.
+    user is located, or after `_MAX_TRACKS` other users. Late signals neither use nor change a
+    track. The times of signals are only compared with those of the same user, because they come
+    from the clock of the user's host.
     """
 
     def __init__(self) -> None:
-        self._tracks: NewestDict[int, _Track] = NewestDict(MAX_USERS)
+        self._tracks: NewestDict[int, _Track] = NewestDict(_MAX_TRACKS)
         #: Posterior of the latest signals if they belong to a track.
         self.posterior: Estimate | None = None
 
@@ -88,13 +92,13 @@ class Tracks:
         `speed_mps`. Raises SignalError if the signals are unusable.
         """
         signals, self.posterior = received.stacked, None
-        # The oldest track comes first.
-        while self._tracks and now_s > next(iter(self._tracks.values())).time_s + MAX_GAP_S:
-            del self._tracks[next(iter(self._tracks))]
         track = self._tracks.get(received.user)
+        if track and track.is_over(now_s):
+            track = None
         if not isinstance(estimator, SearchEstimator) or track and track.is_late(received):
             return estimate_of(estimator, signals)
-        if track is None or not track.may_continue(received, now_s):
+        if track is None or not m.same_instance(
+                received.user_instance, track.latest.user_instance):
             track = _Track(Tracker(estimator, Motion(speed_mps)), received, now_s)
         track.tracker.estimator = estimator
         with calling(type(estimator).__name__, SignalError):

@@ -108,8 +108,20 @@ def test_a_gap_ends_a_track(locate):
     assert locate(0).n_phases == 1
     assert locate(40).n_phases == 2
     assert locate(1, now_s=4.1 + MAX_GAP_S).n_phases == 1
-    locate(2, user=2, now_s=30.0 + MAX_GAP_S)
-    assert len(locate.tracks._tracks) == 1
+
+
+def test_a_clock_that_goes_back_ends_a_track(locate):
+    assert [locate(n, now_s=1000.0 + n).n_phases for n in range(2)] == [1, 2]
+    assert [locate(n, now_s=float(n)).n_phases for n in range(2, 4)] == [1, 2]
+
+
+@pytest.mark.parametrize('ahead_s', [-3600.0, 3600.0])
+def test_users_on_hosts_with_other_clocks_do_not_end_tracks(locate, ahead_s):
+    counts = {1: [], 2: []}
+    for n, user in enumerate([1, 2, 2, 1, 2, 1]):
+        counts[user].append(locate(
+            n, user=user, now_s=n / 10 + ahead_s * (user == 2)).n_phases)
+    assert counts == {1: [1, 2, 3], 2: [1, 2, 3]}
 
 
 def test_each_user_has_a_track_and_their_number_is_bounded(monkeypatch, locate):
