@@ -33,7 +33,7 @@ from rhs_isac_ros.model.arrays import numbers
 from rhs_isac_ros.positioning.site import Site
 from rhs_isac_ros.ros import convert, endpoints, topics
 from rhs_isac_ros.support.errors import translated
-from rhs_isac_ros.support.files import parse_yaml
+from rhs_isac_ros.support.files import parse_yaml, read_yaml
 from rhs_isac_ros.support.optional import MissingLibraryError, optional_import
 
 # Separator between the message definitions of a schema, as in ROS 1 and 2.
@@ -348,17 +348,30 @@ def _parsed(path: str | Path, record: Any) -> Any:
 
 def _records(path: str | Path) -> Iterator[Any]:
     """Yield the records of a file, or of the files of a folder of ``ros2 bag record``."""
-    folder = Path(path)
-    files = [folder]
-    if folder.is_dir():
-        # Without metadata, files may be of different recordings.
-        files = sorted(folder.glob('*.mcap')) if (folder / 'metadata.yaml').exists() else []
-    if not files:
-        raise RecordingError(f'{path}: expected a file, or a folder with metadata.yaml and files '
-                             '*.mcap, which ros2 bag record -s mcap writes, not those of '
-                             '--compression-mode file')
-    for file in files:
+    for file in _files(Path(path)):
         yield from _records_of(file)
+
+
+def _files(path: Path) -> list[Path]:
+    """Return the files of a recording; those of a folder are listed in its metadata.
+
+    Other files in the folder may be copies, or of other recordings.
+    """
+    if not path.is_dir():
+        return [path]
+    try:
+        names = read_yaml(path / 'metadata.yaml')['rosbag2_bagfile_information'][
+            'relative_file_paths']
+        # Early versions put the name of the folder in front.
+        files = [path / Path(name).name for name in names]
+    # The file may be missing, or come from another program.
+    except (KeyError, TypeError, ValueError):
+        files = []
+    if not files or any(file.suffix != '.mcap' for file in files):
+        raise RecordingError(f'{path}: expected a file, or a folder with metadata.yaml, which '
+                             'lists files *.mcap: ros2 bag record -s mcap writes it, without '
+                             '--compression-mode file; ros2 bag convert converts others')
+    return files
 
 
 def _records_of(path: Path) -> Iterator[Any]:

@@ -130,6 +130,12 @@ def test_messages_are_read_in_the_order_of_their_arrival(tmp_path):
         (b'\1', 1.0), (b'\1', 1.0), (b'\2', 2.0), (b'\3', 3.0)]
 
 
+def write_metadata(folder, names):
+    """Write what ``ros2 bag`` reads, as in version 1 and later, of which the fields differ."""
+    (folder / 'metadata.yaml').write_text(yaml.safe_dump({'rosbag2_bagfile_information': {
+        'version': 9, 'storage_identifier': 'mcap', 'relative_file_paths': names}}))
+
+
 def test_a_folder_of_ros2_bag_is_one_recording(tmp_path):
     """Options divide it into files, which number topics and types anew, or compress messages."""
     import zstandard
@@ -148,10 +154,31 @@ def test_a_folder_of_ros2_bag_is_one_recording(tmp_path):
     for act in (lambda: list(read(tmp_path)), lambda: read_networks(tmp_path)):
         with pytest.raises(RecordingError, match='or a folder with metadata.yaml'):
             act()
-    (tmp_path / 'metadata.yaml').touch()
+    write_metadata(tmp_path, ['lab_0.mcap', 'lab_1.mcap'])
     assert [(name, time_s) for name, content, time_s in read(tmp_path)
             if name.encode() == content] == [
         ('/beacon', 1.0), ('/ack', 1.0), ('/ack', 2.0), ('/beacon', 2.0)]
+
+
+@pytest.mark.parametrize('names', [['a.mcap'], ['lab/a.mcap']], ids=str)
+def test_only_the_files_in_the_metadata_of_a_folder_are_read(recording, tmp_path, names):
+    """Others may be copies, such as those that ``mcap recover`` or ``ros2 bag convert`` writes."""
+    for name in ('a.mcap', 'a_recovered.mcap', 'b.mcap'):
+        shutil.copy(recording[0], tmp_path / name)
+    write_metadata(tmp_path, names)
+    assert list(read(tmp_path)) == list(read(recording[0]))
+    assert read_networks(tmp_path).scenario == read_networks(recording[0]).scenario
+
+
+@pytest.mark.parametrize(('names', 'error'), [
+    (['a.mcap', 'b.mcap'], 'b.mcap: cannot be read: No such file'),
+    (['a.mcap.zstd'], 'which lists files .*mcap'), (['a.db3'], 'which lists files .*mcap'),
+    ([], 'which lists files .*mcap'), ([1], 'which lists files .*mcap')], ids=str)
+def test_the_error_names_what_a_folder_lacks(recording, tmp_path, names, error):
+    shutil.copy(recording[0], tmp_path / 'a.mcap')
+    write_metadata(tmp_path, names)
+    with pytest.raises(RecordingError, match=error):
+        list(read(tmp_path))
 
 
 def test_a_recorder_replaces_no_file(tmp_path):
