@@ -330,11 +330,13 @@ class BaseStation(SignalCollector):
         self._users.reject(event.user)
 
     def _accept_ack(self, event: m.Ack) -> None:
-        self.log(self._users.add_answer(event.user, event.sender, self.now_s), warning=True)
+        self.log(self._users.add_answer(event.user, event.sender, self.now_s), warning=True,
+                 key=m.conflict_key(event.sender))
 
     def _register_user(self, event: m.Ack) -> None:
         """Register a user that answered too late for this cycle."""
-        self.log(self._users.register(event.user, event.sender, self.now_s), warning=True)
+        self.log(self._users.register(event.user, event.sender, self.now_s), warning=True,
+                 key=m.conflict_key(event.sender))
 
     def _grant(self, event: m.Ack | Timeout) -> None:
         self._lose_absent()

@@ -5,7 +5,7 @@ import datetime
 import enum
 import functools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,6 +15,7 @@ from rhs_isac_ros.model.arrays import all_finite, is_masked, position_problem
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.gaussian import covariance_problem
 from rhs_isac_ros.support.fields import Field
+from rhs_isac_ros.support.texts import listed
 
 
 class MessageError(ValueError):
@@ -551,7 +552,25 @@ def started(instance: int) -> str:
     return f'started {time:%Y-%m-%d %H:%M:%S} UTC'
 
 
-def describe_conflict(user: int, instance: int) -> str:
-    """Return a log message about two nodes with the same user number; `instance` is served."""
-    return (f'user {user}: two nodes have this number; the first one, {started(instance)}, '
-            'is served')
+def describe_conflict(users: Sequence[int], instance: int) -> str:
+    """Return a text about two nodes with the same numbers of users; `instance` is served."""
+    numbers, these = (('user', 'this number') if len(users) == 1 else ('users', 'these numbers'))
+    return (f'{numbers} {listed(users)}: two nodes have {these}; the first one, '
+            f'{started(instance)}, is served')
+
+
+def conflict_key(instance: int) -> str:
+    """Return the key of log messages about the numbers of a node, which are limited together."""
+    return f'number of {instance}'
+
+
+def describe_conflicts(instances: Mapping[int, int]) -> dict[str, str]:
+    """Return a description for each node that is served, by its key in the diagnostics.
+
+    `instances` contains the node by the number of the user. The key contains the lowest number.
+    """
+    users: dict[int, list[int]] = {}
+    for user in sorted(instances):
+        users.setdefault(instances[user], []).append(user)
+    return {f'conflict.user_{numbers[0]}': describe_conflict(numbers, instance)
+            for instance, numbers in users.items()}

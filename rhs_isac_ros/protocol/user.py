@@ -65,8 +65,8 @@ class User(StateMachine):
         super().__init__(UserState.DISCONNECTED)
         self._step_s, self._beacon_s = step_s, beacon_s
         self.users, self._instance = tuple(sorted(mobilities)), instance
-        # Description of another node that is served under the same number, by user.
-        self._conflicts: dict[int, str] = {}
+        # Instance of another node that is served under the same number, by user.
+        self._conflicts: dict[int, int] = {}
         self._mobilities, self._world_s, self._scenario = mobilities, world_s, scenario
         self._crowd = Crowd([mobilities[user] for user in self.users])
         self._cycle_id = 0
@@ -106,8 +106,8 @@ class User(StateMachine):
         return timeouts.get(state)
 
     def status(self) -> Mapping[str, str]:
-        """Return ``conflict.user_<n>`` for each number under which another node is served."""
-        return {f'conflict.user_{user}': text for user, text in self._conflicts.items()}
+        """Return ``conflict.user_<n>`` for each node that is served under the same numbers."""
+        return m.describe_conflicts(self._conflicts)
 
     # Guards
 
@@ -176,9 +176,10 @@ class User(StateMachine):
                        warning=bool(self._truths))
 
     def _log_other_instance(self, event: m.Grant) -> None:
-        text = m.describe_conflict(event.user, event.user_instance)
-        self.log('' if event.user in self._conflicts else text, warning=True)
-        self._conflicts[event.user] = text
+        if event.user not in self._conflicts:
+            self.log(m.describe_conflict([event.user], event.user_instance), warning=True,
+                     key=m.conflict_key(event.user_instance))
+        self._conflicts[event.user] = event.user_instance
 
     def _note_beacon(self, event: m.Beacon) -> None:
         """Store the attempt, so that a late beacon of the same cycle is recognised."""

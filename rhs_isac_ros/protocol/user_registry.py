@@ -50,8 +50,8 @@ class UserRegistry:
     def __init__(self, policy: str, rng: np.random.Generator) -> None:
         self.policy, self._rng = policy, rng
         self._users: dict[int, _User] = {}
-        # Time at which a conflict was last observed [s] and its description, by number.
-        self._conflicts: dict[int, tuple[float, str]] = {}
+        # Time at which a conflict was last observed [s], and the owner of the number, by number.
+        self._conflicts: dict[int, tuple[float, int]] = {}
         # The registered users that were invited and have not answered yet.
         self._awaited: set[int] = set()
         # Users to serve once before all others, in the order of the requests.
@@ -138,9 +138,9 @@ class UserRegistry:
             user.order = self._n_grants, 0, number
         warning = ''
         if user.rejected and instance == user.instance:
-            text = m.describe_conflict(number, instance)
-            warning = '' if text in self.conflicts(now_s).values() else text
-            self._conflicts[number] = now_s, text
+            if self._in_conflict(now_s).get(number) != instance:
+                warning = m.describe_conflict([number], instance)
+            self._conflicts[number] = now_s, instance
         user.missed, user.rejected, user.instance, user.answered_s = 0, 0, instance, now_s
         return warning
 
@@ -161,9 +161,12 @@ class UserRegistry:
         return user.instance if user else 0
 
     def conflicts(self, now_s: float) -> dict[str, str]:
-        """Return a description of each conflict, by its key in the diagnostics."""
-        return {f'conflict.user_{number}': text
-                for number, (latest_s, text) in self._conflicts.items()
+        """Return a description of the conflicts of each owner, by its key in the diagnostics."""
+        return m.describe_conflicts(self._in_conflict(now_s))
+
+    def _in_conflict(self, now_s: float) -> dict[int, int]:
+        """Return the owner of each number that another node has, too."""
+        return {number: instance for number, (latest_s, instance) in self._conflicts.items()
                 if now_s < latest_s + _CONFLICT_S}
 
     def remove_all_except(self, is_allowed: Callable[[int], bool]) -> list[int]:

@@ -146,7 +146,7 @@ def test_the_true_position_of_a_cycle_is_that_at_its_reference_time():
 def users():
     """Users 4 to 6 of one node, connected."""
     made = User({user: mobility.Static((user, 0.0, 0.0)) for user in (4, 5, 6)},
-                ONE_FRAME, step_s=0.5, beacon_s=1.5)
+                ONE_FRAME, step_s=0.5, beacon_s=1.5, instance=7)
     made.handle(PeersChanged(()), 0.0)
     return made
 
@@ -187,6 +187,17 @@ def test_a_cycle_serves_the_user_of_the_node_that_is_granted_it(users, user):
     (uplink,) = answers(users, data(user=user), 1.3)
     assert uplink.user == user
     assert users.state is UserState.LISTENING
+
+
+def test_the_numbers_that_another_node_has_are_logged_under_one_key(users):
+    """The log of a node with a thousand users contains one line a minute about them."""
+    found = [action for user in users.users for action in users.handle(
+        m.Grant(cycle_id=7, user=user, user_instance=5), 0.0)]
+    assert [one.text.partition(':')[0] for one in found] == [
+        f'user {user}' for user in users.users]
+    assert len({one.key for one in found}) == 1
+    (text,) = users.status().values()
+    assert 'two nodes have these numbers' in text
 
 
 def test_the_true_positions_of_all_users_of_a_node(users):

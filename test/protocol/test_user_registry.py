@@ -291,3 +291,18 @@ def test_a_conflict_is_logged_once_until_it_has_ended(instances):
     assert instances.conflicts(20.0) == {}
     instances.reject(2)
     assert instances.register(2, FIRST, 21.0) == first
+
+
+def test_conflicts_with_one_node_are_one_text(instances):
+    for number in range(3, 403):
+        instances.register(number, FIRST, 10.0)
+        instances.reject(number)
+        instances.register(number, FIRST, 11.0)
+    instances.register(500, SECOND, 10.0)
+    instances.reject(500)
+    instances.register(500, SECOND, 11.0)
+    texts = instances.conflicts(12.0)
+    assert texts.keys() == {'conflict.user_3', 'conflict.user_500'}
+    assert texts['conflict.user_3'].startswith(
+        'users 3, 4, 5, 6, 7, 8, 9, 10 and 392 others: two nodes have these numbers; the first')
+    assert texts['conflict.user_500'].startswith('user 500: two nodes have this number')
