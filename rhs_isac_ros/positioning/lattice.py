@@ -192,7 +192,9 @@ def lay_grid(scenario: Scenario) -> Grid:
     return Grid(
         read_only(nodes), read_only((edges_m[1:] + edges_m[:-1]) / 2), read_only(np.diff(edges_m)),
         read_only(node_at[shell_of_cell, cell_direction]), read_only(range_bin),
-        list(map(Shell, nodes_of_shell.slices, bins_of_shell.slices, cells_of_shell.slices)))
+        [Shell(*one) for one in zip(
+            nodes_of_shell.slices, bins_of_shell.slices, cells_of_shell.slices, strict=True)
+         if one[0].start < one[0].stop])
 
 
 def _range_edges(resolution: Resolution) -> np.ndarray:

@@ -54,6 +54,14 @@ def test_the_grid_follows_the_number_of_distinguishable_directions(changes, fact
     assert counts[1] / counts[0] == pytest.approx(factor, rel=0.35)
 
 
+def test_every_part_of_the_grid_has_templates():
+    """The first range bins reach beyond the corners of the region."""
+    grid = lay_grid(Scenario(
+        center_frequencies_hz=(1.5e9,), element_interval_wavelengths=0.59, n_subbands=1,
+        roi_center_m=(0.9, -0.71, 0.55), roi_size_m=(0.996, 0.642, 0.841)))
+    assert all(one.start < one.stop for shell in grid.shells for one in shell)
+
+
 def test_a_step_in_direction_changes_the_phase_at_the_edge_by_one_radian():
     scenario = Scenario()
     edge_m = np.abs(element_positions(scenario)).max()
