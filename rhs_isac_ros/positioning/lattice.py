@@ -76,8 +76,11 @@ class Resolution(NamedTuple):
         bounds = scenario.roi_bounds_m
         direction = 1 / np.maximum(wavenumber * edge_m, 1 / _DIRECTION)
         times_s = frame_times_s(scenario)
-        # Even a single frame has a duration.
-        band_s = np.ptp(times_s[0]) + scenario.frame_duration_s
+        # Even a single frame has a duration. It shows no rate, whose step is then huge.
+        half_s = np.array([np.ptp(times_s[0]) + scenario.frame_duration_s,
+                           *2 * [np.ptp(times_s) + 2 * scenario.frame_duration_s]]) / 2
+        counts = np.array([scenario.n_frames, *2 * [times_s.size]])
+        half_s *= np.sqrt(np.maximum(1 - 1 / counts**2, np.finfo(np.float32).tiny))
         (nearest_m, *lowest), (farthest_m, *highest) = polar_bounds(bounds).tolist()
         return cls(
             wavelength_m=SPEED_OF_LIGHT_MPS / max(scenario.center_frequencies_hz),
@@ -86,9 +89,7 @@ class Resolution(NamedTuple):
             delay_m=SPEED_OF_LIGHT_MPS / (np.pi * scenario.bandwidth_hz),
             nearest_m=max(nearest_m, _NEAREST * farthest_m), farthest_m=farthest_m,
             direction_bounds=np.stack([lowest, highest], axis=1), bounds_m=bounds,
-            rate_steps=np.append(
-                _RATE[0] / (wavenumber * band_s / 2),
-                _RATE[1] / (times_s.max() + scenario.frame_duration_s) * direction))
+            rate_steps=np.append(_RATE[0] / wavenumber, _RATE[1] * direction) / half_s)
 
     def bin_width_m(self, range_m: float) -> float:
         """Return the width of a range bin, in which delays and amplitudes hardly change [m]."""

@@ -31,6 +31,7 @@ from rhs_isac_ros.model.constants import POWER_NEPERS_PER_DB
 from rhs_isac_ros.model.geometry import (
     frame_times_s,
     jacobian,
+    polar_derivative,
     stands_still,
     velocity_std_mps,
 )
@@ -186,19 +187,20 @@ class _Others:
 
         Each mode keeps its state of the surface.
         """
-        likelihood, prior = self._likelihood, self._declared
-        n_moving, n_wide = prior.velocity.shape[1], likelihood.nuisance.velocity.shape[1]
+        likelihood, prior, wide = self._likelihood, self._declared, self._likelihood.nuisance
+        n_moving, n_wide = prior.velocity.shape[1], wide.velocity.shape[1]
         others = modes.values[:, n_moving:][:, ~prior.phases[:, n_moving:].any(axis=0)]
         velocities, away = (
             modes.values[:, :n_moving] @ prior.velocity.T, jacobian(modes.points)[:, :, 0])
         along = np.sum(velocities * away, axis=1)[:, None] * away
         velocities = along + self._across * (velocities - along) + self._further_mps * away
-        values = np.zeros((*velocities.shape[:2], len(likelihood.nuisance)))
-        values[..., :n_wide] = velocities @ np.linalg.pinv(likelihood.nuisance.velocity).T
-        values[..., n_wide:n_wide + others.shape[1]] = others
         n = len(self._further_mps)
         points, state = np.tile(modes.points, (n, 1)), np.tile(modes.state, n)
-        starts = Starts(np.zeros(len(points), int), points, values.reshape(len(points), -1))
+        values = np.zeros((len(points), len(wide)))
+        values[:, n_wide:n_wide + others.shape[1]] = np.tile(others, (n, 1))
+        values = wide.with_rates(values, points, np.matmul(
+            polar_derivative(points), velocities.reshape(-1, 3, 1))[..., 0])
+        starts = Starts(np.zeros(len(points), int), points, values)
         signals, mass = likelihood.signals(signals.received), modes.log_mass
         states = [(self._refinement.same(conditionals[one]), state == one)
                   for one in np.unique(state)]

@@ -14,7 +14,7 @@ import numpy as np
 
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.arrays import adjoint
-from rhs_isac_ros.model.geometry import frame_times_s, jacobian
+from rhs_isac_ros.model.geometry import frame_times_s
 from rhs_isac_ros.positioning.estimate import Fit
 from rhs_isac_ros.positioning.grid import Draw, Starts, TemplateTable, separate
 from rhs_isac_ros.positioning.lattice import PHASE_ERROR, Grid
@@ -36,9 +36,11 @@ class _Shell(NamedTuple):
     """Templates of one range, and the ranges and rates for which they are used."""
 
     nodes: slice
-    nearest_m: float
-    farthest_m: float
     ranges_m: np.ndarray  # Ranges whose delays represent those of the shell, float64 [R].
+    # Nearest and farthest range of users with such a delay in the direction of a template, where
+    # the second one is larger, float64 [R, G].
+    nearest_m: np.ndarray
+    farthest_m: np.ndarray
     rates: np.ndarray  # Hypotheses of the rates of u and v, float64 [H, 2] [1/s].
     # Index of the template of each frame for each hypothesis, int [H, N_B, G, F], and the offset
     # of its direction from that of the frame, float32 [H, 2, N_B, G, F].
@@ -72,7 +74,7 @@ class MovingTable(TemplateTable):
         super().__init__(scenario, arrays, grid)
         self._times_s, self._std = frame_times_s(scenario), scenario.user_speed_std_mps
         self._steps = self._resolution.rate_steps
-        n = int(np.ceil(_RADIAL * self._std / self._steps[0]))
+        n = round(_RADIAL * self._std / self._steps[0])
         self._speeds = np.arange(-n, n + 1) * self._steps[0]
         # Phases that add up the frames of a user with each radial speed, [N_B, F, V].
         self._ramps = np.exp(1j * (self._carriers[:, None] * self._times_s)[..., None]
@@ -80,15 +82,20 @@ class MovingTable(TemplateTable):
         self._penalty = ((self._speeds / self._std)**2 / 2).astype(np.float32)
         self._shells = [self._shell(*one) for one in self.grid.shells]
 
-    def _shell(self, nodes: slice, bins: slice, _: slice) -> _Shell:
+    def _shell(self, nodes: slice, bins: slice, cells: slice) -> _Shell:
         from scipy.spatial import cKDTree
 
         grid, resolution = self.grid, self._resolution
-        nearest, farthest = bins.start, bins.stop - 1
-        low = float(grid.ranges_m[nearest] - grid.widths_m[nearest] / 2)
-        high = float(grid.ranges_m[farthest] + grid.widths_m[farthest] / 2)
+        lowest, highest = (grid.ranges_m + sign * grid.widths_m / 2 for sign in (-1, 1))
+        low, high = float(lowest[bins.start]), float(highest[bins.stop - 1])
         n_ranges = int(np.ceil((high - low) / (2 * PHASE_ERROR * resolution.delay_m)))
-        ranges_m = low + (np.arange(n_ranges) + 0.5) * (high - low) / n_ranges
+        edges_m = np.linspace(low, high, n_ranges + 1)[:, None]
+        ranges_m = (edges_m[1:, 0] + edges_m[:-1, 0]) / 2
+        # In each direction, part of the ranges is in the region.
+        node, range_bin = grid.node[cells] - nodes.start, grid.range_bin[cells]
+        first, last = (np.full(nodes.stop - nodes.start, sign * np.inf) for sign in (1, -1))
+        np.minimum.at(first, node, lowest[range_bin])
+        np.maximum.at(last, node, highest[range_bin])
         counts = np.round(_ACROSS * self._std / (low * self._steps[1:])).astype(int)
         rates = np.stack(np.meshgrid(*(
             np.arange(-n, n + 1) * step for n, step in zip(counts, self._steps[1:], strict=True)
@@ -103,7 +110,8 @@ class MovingTable(TemplateTable):
         growth_m = (low + high) / 4 * squares[:, None, :, None] * self._times_s[:, None]**2
         bend = np.exp(1j * self._carriers[:, None, None] * growth_m).astype(np.complex64)
         shell = _Shell(
-            nodes, low, high, ranges_m, rates, index, offset, squares, bend, np.zeros(0))
+            nodes, ranges_m, np.maximum(edges_m[:-1], first), np.minimum(edges_m[1:], last),
+            rates, index, offset, squares, bend, np.zeros(0))
         energy = np.stack([[self._energy(shell, hypothesis, range_m) for range_m in ranges_m]
                            for hypothesis in range(len(rates))])
         return shell._replace(inverse=1 / np.maximum(energy, np.finfo(np.float32).tiny))
@@ -154,10 +162,8 @@ class MovingTable(TemplateTable):
         radii = np.concatenate([self._resolution.separation(prior.is_coarse), self._steps])
         places = np.hstack([points, rates])[order]
         order = order[separate(np.zeros(len(order), int), places, radii)][:_STARTS]
-        values = prior.start(outputs[order].T, gains[order])
-        n_moving = prior.velocity.shape[1]
-        velocities = np.matmul(jacobian(points[order]), rates[order, :, None])[..., 0]
-        values[:, :n_moving] = velocities @ np.linalg.pinv(prior.velocity).T
+        values = prior.with_rates(
+            prior.start(outputs[order].T, gains[order]), points[order], rates[order])
         return Starts(np.full(len(order), shot), points[order], values)
 
     def _filtered(self, shell: _Shell, signals: np.ndarray) -> np.ndarray:
@@ -179,17 +185,28 @@ class MovingTable(TemplateTable):
                       out=outputs[band])
         inverse = shell.inverse[hypothesis]
         # Bounds of the log-likelihood, for the best range or gain.
-        amplitude = prior.amplitude(outputs)
-        bound = (amplitude**2 * inverse - self._penalty).ravel()
-        n = min(_CANDIDATES, bound.size)
-        chosen = np.argpartition(bound, -n)[-n:]
-        _, node, speed = np.unravel_index(chosen, amplitude.shape)
+        amplitude, tiny = prior.amplitude(outputs), np.finfo(np.float32).tiny
+        bound = amplitude**2 * inverse - self._penalty
+        is_used = shell.nearest_m < shell.farthest_m
+        bound[~is_used] = -np.inf
+        n = min(_CANDIDATES, int(np.count_nonzero(is_used)) * len(self._speeds))
+        chosen = np.argpartition(bound.ravel(), bound.size - n)[bound.size - n:]
+        delay, node, speed = np.unravel_index(chosen, amplitude.shape)
         amplitude, inverse = amplitude.ravel()[chosen], inverse.ravel()[chosen]
-        best_m = np.clip(1 / np.maximum(amplitude * inverse, np.finfo(np.float32).tiny),
-                         shell.nearest_m, shell.farthest_m)
+        # The range follows from the amplitude, for the median of the gain, and for the gain of
+        # the rest of the signals. In strong signals, this rest is that of the templates.
+        rest = np.maximum(energy - amplitude**2 * inverse, tiny)
+        gain = np.zeros((1, n))
+        if prior.gain_std:
+            gain = np.vstack([gain, prior.maximised_over_gain(0 * rest, rest, n_measurements)[1]])
+        best_m = np.clip(np.exp(gain) / np.maximum(amplitude * inverse, tiny),
+                         shell.nearest_m[delay, node], shell.farthest_m[delay, node])
         value, gain = prior.maximised_over_gain(amplitude / best_m, energy, n_measurements)
         value = value - 1 / (inverse * best_m**2) - self._penalty[speed] - (
             shell.squares[hypothesis, node] * best_m**2 / (2 * self._std**2))
+        n_times = len(best_m)
+        points = np.column_stack([best_m.ravel(), np.tile(directions[node], (n_times, 1))])
         rates = np.column_stack([self._speeds[speed], np.broadcast_to(rates, (n, 2))])
-        return (value, np.column_stack([best_m, directions[node]]), rates,
-                np.broadcast_to(gain, n), outputs.reshape(len(outputs), -1)[:, chosen].T)
+        return (value.ravel(), points, np.tile(rates, (n_times, 1)),
+                np.broadcast_to(gain, value.shape).ravel(),
+                np.tile(outputs.reshape(len(outputs), -1)[:, chosen].T, (n_times, 1)))

@@ -26,6 +26,8 @@ UNIFORM_EQUIVALENT = np.sqrt(2 * np.pi)
 # density then has many peaks along the range, too narrow for Gaussians. Its information is added
 # to the samples of the posterior afterwards.
 COARSE_STD_RAD = 0.75
+# Variance of a rate that is known up to half a step.
+_STEP_VARIANCE = 1 / 12
 # Largest logarithm of the power of noise relative to signals, which keeps it finite.
 _MAX_EXPONENT = 300.0
 
@@ -207,13 +209,25 @@ class NuisancePrior(Exponents):
 
         Signals determine these rates, so they hardly change within a mode.
         """
+        return self.with_rates(values, target, self.rates(values, points))
+
+    def with_rates(self, values: np.ndarray, points: np.ndarray, rates: np.ndarray) -> np.ndarray:
+        """Return parameters [M, Q] whose rates at points are nearly `rates`, [M, 3] [1/s].
+
+        In a plane or on a line, users cannot have all rates: these are the nearest ones, in steps
+        over which signals change. Where rates of a step need more than the declared velocity, it
+        remains nearly that of the given parameters.
+        """
         n_moving = self.velocity.shape[1]
         if not n_moving:
             return values
-        rates = self.rates(values, points)
-        velocities = np.matmul(jacobian(target), rates[..., None])[..., 0]
-        return np.hstack([
-            velocities @ np.linalg.pinv(self.velocity).T, values[:, n_moving:]])
+        steps = Resolution.of(self.scenario).rate_steps[:, None]
+        slopes = np.matmul(polar_derivative(points), self.velocity) / steps
+        misses = (rates - self.rates(values, points))[..., None] / steps
+        transposed = np.swapaxes(slopes, 1, 2)
+        change = np.linalg.solve(np.matmul(transposed, slopes) + _STEP_VARIANCE * np.eye(n_moving),
+                                 np.matmul(transposed, misses))
+        return np.hstack([values[:, :n_moving] + change[..., 0], values[:, n_moving:]])
 
     def columns(self, values: np.ndarray, received: np.ndarray, mean: np.ndarray,
                 slopes: np.ndarray, *linear: np.ndarray) -> np.ndarray:

@@ -1,16 +1,18 @@
 """Positions and velocities of users who move during a cycle."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.special import chdtri
-from walking_users import inside, system_of, users_of
+from walking_users import WALKING, inside, system_of, users_of
 
 from rhs_isac_ros.codebook import Codebook
 from rhs_isac_ros.model import Scenario
-from rhs_isac_ros.model.geometry import to_polar, to_positions
+from rhs_isac_ros.model.geometry import to_polar, to_positions, velocity_std_mps
 from rhs_isac_ros.positioning import BayesEstimator, MlEstimator
+from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.mixture import Mixture
 from rhs_isac_ros.system import System
@@ -76,6 +78,49 @@ def test_positions_and_velocities_are_in_their_regions(walking):
     assert inside(errors[:, :2], joint[:, :2, :2], 2) >= 0.85
     assert inside(errors, joint, 4) >= 0.85
     assert np.sqrt(np.mean(errors[:, 2:]**2)) < 0.3
+
+
+@pytest.mark.parametrize('changes', [
+    dict(roi_center_m=(2.5, -2, 0), roi_size_m=(0, 2, 0)),
+    dict(roi_center_m=(4, 0, -2), roi_size_m=(4, 2, 0), user_gain_std_db=6.0)],
+    ids=['line', 'gain'])
+def test_strong_signals_are_found_wherever_users_can_be(changes):
+    """Where users cannot have all rates or ranges, starts have those that they can have."""
+    system, rng = system_of(multipath_to_los_db=-20, **changes), np.random.default_rng(7)
+    scenario, n = system.scenario, 8
+    states = np.hstack([scenario.sample_positions(n, rng),
+                        velocity_std_mps(scenario) * rng.standard_normal((n, 3))])
+    estimate = BayesEstimator(system).estimate(system.sample(states, rng))
+    assert estimate.fix.all()
+    axes = np.flatnonzero(scenario.roi_size_m)
+    assert inside((estimate.mean - states[:, :3])[:, axes],
+                  estimate.covariance[:, axes[:, None], axes], len(axes)) >= 7 / 8
+
+
+def test_the_nearest_rates_in_a_plane_keep_what_signals_show():
+    """A radial speed turns the phase; the direction hardly changes in a cycle."""
+    system = system_of(roi_center_m=(2, -2, 0), roi_size_m=(0, 1, 1))
+    prior, point = Likelihood(system).nuisance, to_polar(np.array([[2.0, -2.0, 0.3]]))
+    values = np.zeros((1, len(prior)))
+    found = prior.rates(prior.with_rates(values, point, np.array([[1.0, 0.0, 0.0]])), point)
+    assert found[0, 0] == pytest.approx(1, abs=0.05)
+    values[0, :2] = 0.7, -0.4
+    rates = prior.rates(values, point)
+    np.testing.assert_allclose(prior.with_rates(values, point, rates), values)
+    np.testing.assert_allclose(
+        prior.with_rates(np.zeros_like(values), point, rates)[0, :2], values[0, :2], atol=0.05)
+
+
+def test_single_frames_show_no_radial_speed():
+    """Starts that differ only by such a speed would displace others."""
+    scenario = dataclasses.replace(WALKING, n_frames=1, frame_duration_s=0.3)
+    radial, *across = Resolution.of(scenario).rate_steps
+    assert radial > 1e9
+    assert max(across) < 1
+    alone = dataclasses.replace(scenario, center_frequencies_hz=(5e9,))
+    assert Resolution.of(alone).rate_steps.min() > 1e9
+    table = BayesEstimator(system_of(n_frames=1, roi_size_m=(0, 0.5, 0)))._region.table
+    np.testing.assert_array_equal(table._speeds, 0)
 
 
 @pytest.mark.slow
