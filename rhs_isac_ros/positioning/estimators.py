@@ -132,10 +132,6 @@ class SearchEstimator(abc.ABC):
             self._averaging.states(MeasurementModel.covariance_in_shadow))
         ] if scenario.blocked_probability else []
         self._shadow = Alignment(likelihood, np.zeros_like(likelihood.model.combined_root))
-        # Twice an energy has two degrees of freedom for each complex measurement, less one for
-        # each fitted coordinate or parameter.
-        n_fitted = 3 + len(prior)
-        self._mean_residual = max(n_measurements - n_fitted / 2, 0.5)
         # Whether the likelihood depends on nothing but the position.
         self._is_plain = self._refinement.is_exact and not len(prior)
         # Points that represent a standard Gaussian, float64 [128, 3].
@@ -374,10 +370,13 @@ class SearchEstimator(abc.ABC):
                 coarse), signals, scope.table), signals)
         means, covariances = self._moments(modes, samples)
         # If the model holds, twice the residual energy, averaged over the posterior, has the mean
-        # of a chi-square variable. At the best of several modes, it is smaller than the average.
-        # The best mode of each shot comes first.
+        # of a chi-square variable, with two degrees of freedom for each complex measurement, less
+        # one for each fitted coordinate or parameter. At the best of several modes, it is smaller
+        # than the average. The best mode of each shot comes first.
         residuals = samples.of_shot.first(modes.residual)
-        expected = self._mean_residual - (samples.average(modes.residual) - residuals)
+        n_fitted = self._n_fitted(select(modes, samples.of_shot.starts), signals)
+        expected = np.maximum(self._n_measurements - n_fitted / 2, 0.5) - (
+            samples.average(modes.residual) - residuals)
         gains = samples.of_shot.first(modes.values) @ likelihood.nuisance.gain
         for n, (shot, *fit) in enumerate(zip(
                 conditionals, means, covariances, samples.log_evidence.tolist(),
@@ -389,6 +388,20 @@ class SearchEstimator(abc.ABC):
                 samples.described, n, None if likelihood.nuisance.is_coarse else of_shot,
                 self._bounds)
             yield shot, _Searched(Fit._make((*fit, describe)), of_shot, conditionals[shot])
+
+    def _n_fitted(self, modes: Modes, signals: Signals) -> np.ndarray:
+        """Return the numbers of coordinates and parameters that signals determine, float64 [M].
+
+        Where a prior determines a parameter, the residual is no smaller.
+        """
+        prior, n_axes = self._likelihood.nuisance, np.count_nonzero(self.scenario.roi_size_m)
+        if not len(prior):
+            return np.full(len(modes.shots), float(n_axes))
+        information = self._likelihood.local(
+            modes.points, modes.values, select(signals, modes.shots)).information
+        variances = np.diagonal(np.linalg.inv(information), axis1=1, axis2=2)[:, 3:]
+        found: np.ndarray = n_axes + np.sum(1 - np.clip(prior.precision * variances, 0, 1), axis=1)
+        return found
 
     def _samples(self, modes: Modes, conditionals: Mapping[int, Sequence[Conditional]],
                  signals: Signals) -> Samples:

@@ -143,8 +143,9 @@ class MovementTest:
         if not len(moving):
             return ''
         median_db, std_db = scenario.multipath_level_db
-        residual = fit.residual / (10**(median_db / 10) * max(fit.expected, 0.5))
-        std = np.hypot(self._system.n_whitened**-0.5, POWER_NEPERS_PER_DB * std_db)
+        expected = max(fit.expected, 0.5)
+        residual = fit.residual / (10**(median_db / 10) * expected)
+        std = np.hypot(expected**-0.5, POWER_NEPERS_PER_DB * std_db)
         speeds = fit.mean[3 + moving] / scenario.user_speed_std_mps
         # Fisher's method combines the probabilities.
         product = float(ndtr(-np.log(residual) / std) * chdtrc(len(speeds), np.sum(speeds**2)))

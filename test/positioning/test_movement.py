@@ -86,6 +86,15 @@ def test_independent_frames_contain_what_failed_elements_do():
     assert ratios[0] == pytest.approx(ratios[1], abs=1e-6)
 
 
+def test_a_residual_of_few_expected_measurements_varies_more():
+    """Although there are many measurements, the fit may explain most of them by several modes."""
+    system = system_of()
+    test = MovementTest(system, Likelihood(system))
+    fits = [Fit(np.zeros(6), np.eye(6), 0.0, 0.0, 3 * expected, expected, 0.0, None)
+            for expected in (4.0, 40.0)]
+    assert [bool(test._too_fast(one)) for one in fits] == [False, True]
+
+
 def test_short_frames_need_no_test():
     short = system_of(frame_duration_s=4e-6, user_speed_std_mps=0.0)
     assert MovementTest.of(short, Likelihood(short)) is None

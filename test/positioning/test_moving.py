@@ -15,6 +15,7 @@ from rhs_isac_ros.positioning import BayesEstimator, MlEstimator
 from rhs_isac_ros.positioning.lattice import Resolution
 from rhs_isac_ros.positioning.likelihood import Likelihood
 from rhs_isac_ros.positioning.mixture import Mixture
+from rhs_isac_ros.positioning.search import Modes
 from rhs_isac_ros.system import System
 
 CONFIG = Path(__file__).parents[2] / 'config'
@@ -121,6 +122,23 @@ def test_single_frames_show_no_radial_speed():
     assert Resolution.of(alone).rate_steps.min() > 1e9
     table = BayesEstimator(system_of(n_frames=1, roi_size_m=(0, 0.5, 0)))._region.table
     np.testing.assert_array_equal(table._speeds, 0)
+
+
+def test_what_a_prior_determines_does_not_reduce_the_residual():
+    short, long = (BayesEstimator(
+        system_of(frame_duration_s=duration_s, timing_std_s=1e-12), lazy=True)
+        for duration_s in (1e-6, 0.015))
+    state = users_of(WALKING, 1, 0.5, np.random.default_rng(1))
+    for estimator, n_velocity in (short, 0), (long, 2):
+        signals = estimator._likelihood.signals(
+            estimator.system.sample(state, np.random.default_rng(2)))
+        zeros = np.zeros(1)
+        values = np.zeros((1, len(estimator._likelihood.nuisance)))
+        values[:, :2] = state[:, 3:5]
+        modes = Modes(zeros.astype(int), to_polar(state[:, :3]), zeros, zeros, zeros, values,
+                      zeros, zeros)
+        # Two coordinates in the plane, and the phases of two bands.
+        assert estimator._n_fitted(modes, signals) == pytest.approx(4 + n_velocity, abs=0.2)
 
 
 @pytest.mark.slow
