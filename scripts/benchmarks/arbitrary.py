@@ -13,9 +13,15 @@ this number of dimensions: 1 for a consistent estimate. A row is marked if less 
 positions are in the region, NEES exceeds 1.6, or less than 95 % of the estimates are fixes, by
 more than chance: the 95 % interval contains no value within the limit. The 95 % intervals of
 shares are Wilson's; those of NEES are from a percentile bootstrap.
+
+With `--walking`, users move by 0.01 to 30 wavelengths in a cycle, but not by more than 0.4 of the
+shortest range, with standard deviations that the scenario declares; up to 32 frames, and times to
+retune, are drawn as well. A row then also contains the velocity, and is marked if its limits are
+exceeded.
 """
 
 import dataclasses
+import functools
 import time
 from typing import Any
 
@@ -27,6 +33,7 @@ from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.experiments.resampling import share_percent
 from rhs_isac_ros.model import Scenario
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
+from rhs_isac_ros.model.geometry import polar_bounds, velocity_std_mps
 from rhs_isac_ros.positioning import make_estimator
 from rhs_isac_ros.support.arguments import integer
 from rhs_isac_ros.system import System
@@ -44,22 +51,32 @@ def main() -> None:
     parser.add_argument('--first', type=integer(0, 10**9), default=0, help='first seed')
     parser.add_argument('--scenarios', type=integer(1, 10**6), default=40,
                         help='number of scenarios')
+    parser.add_argument('--walking', action='store_true',
+                        help='users walk in a cycle, with a declared velocity')
     options = parser.parse_args()
     seeds = range(options.first, options.first + options.scenarios)
     results = frame.measured(options, 'arbitrary', measure, {
-        str(one): {'seed': one, 'n': options.positions} for one in seeds})
+        str(one): {'seed': one, 'n': options.positions, 'walking': options.walking}
+        for one in seeds})
     table = frame.Table(['seed', 'scenario', ''], {
         'fix [%]': ('fix', 1), 'in the 95 % region [%]': ('covered', 1), 'NEES': ('nees', 2),
-        'error [m]': ('rms_m', 3), 'time of a fix [ms]': ('fix_ms', 1)})
+        'error [m]': ('rms_m', 3), **({
+            'velocity in its region [%]': ('velocity_covered', 1),
+            'NEES of the velocity': ('velocity_nees', 2)} if options.walking else {}),
+        'time of a fix [ms]': ('fix_ms', 1)})
     for name, figures in results.items():
         table.row(name, figures['about'], 'marked' if figures['marked'] else '', **figures)
     frame.write_results(options.json, results)
 
 
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """Draw a number whose logarithm is uniform."""
+    return float(f'{np.exp(rng.uniform(np.log(low), np.log(high))):.3g}')
+
+
 def draw(rng: np.random.Generator) -> Scenario:
-    """Draw a scenario."""
-    def between(low: float, high: float) -> float:
-        return float(f'{np.exp(rng.uniform(np.log(low), np.log(high))):.3g}')
+    """Draw a scenario of users at rest."""
+    between = functools.partial(log_uniform, rng)
 
     def maybe(share: float, value: Any, otherwise: Any = 0.0) -> Any:
         return value if rng.uniform() < share else otherwise
@@ -107,32 +124,65 @@ def draw(rng: np.random.Generator) -> Scenario:
         blocked_probability=maybe(0.1, between(0.05, 0.3)))
 
 
-def measure(seed: int, n: int) -> dict[str, Any]:
+def with_velocity(at_rest: Scenario, rng: np.random.Generator) -> Scenario:
+    """Let the users of a scenario walk in a cycle."""
+    between = functools.partial(log_uniform, rng)
+    wavelength_m = SPEED_OF_LIGHT_MPS / at_rest.center_frequencies_hz[0]
+    nearest_m = float(polar_bounds(at_rest.roi_bounds_m)[0, 0])
+    std_mps, n_frames = between(0.05, 5.0), int(between(1, 33))
+    way_m = min(between(0.01, 30.0) * wavelength_m, 0.4 * nearest_m)
+    retuning = rng.uniform() * (rng.uniform() < 0.3)  # Relative to the time of a band.
+    n_bands, cycle_s = at_rest.n_bands, way_m / std_mps
+    band_s = min(cycle_s / (n_bands + (n_bands - 1) * retuning), n_frames)
+    return dataclasses.replace(
+        at_rest, n_frames=n_frames, frame_duration_s=band_s / n_frames,
+        retune_s=retuning * band_s, user_speed_std_mps=std_mps,
+        # The multipath may change less than the direct path, or not at all.
+        max_user_speed_mps=std_mps * float(rng.choice([3**0.5, 0.02, 0.0], p=[0.7, 0.15, 0.15])),
+        carrier_offset_std_hz=(rng.uniform() < 0.2) * between(0.01, 1.0) / cycle_s)
+
+
+def measure(seed: int, n: int, walking: bool = False) -> dict[str, Any]:
     """Measure the scenario of a seed with n positions."""
     rng = np.random.default_rng(seed)
     scenario = draw(rng)
+    if walking:
+        scenario = with_velocity(scenario, rng)
     codebook = random_codebook(scenario, rng)
     # Positions of users without a direct path have no error to measure.
-    emulated = dataclasses.replace(scenario, blocked_probability=0.0)
-    positions, received = System(emulated, codebook).pairs(n, seed)
+    emulated = System(dataclasses.replace(scenario, blocked_probability=0.0), codebook)
+    positions, received = emulated.pairs(n, seed)
+    velocities = velocity_std_mps(scenario) * rng.standard_normal((n, 3))
+    if walking:
+        received = emulated.sample(np.hstack([positions, velocities]), rng)
     estimator = make_estimator('bayes', scenario, codebook)
     begin_s = time.process_time()
     estimate = estimator.estimate(received)
     fix_ms = 1e3 * (time.process_time() - begin_s) / n
-    axes = np.flatnonzero(scenario.roi_size_m)
-    fix = estimate.fix
+    axes, fix = np.flatnonzero(scenario.roi_size_m), np.asarray(estimate.fix)
     errors = (estimate.mean - positions)[fix][:, axes]
-    squares = np.sum(errors * np.linalg.solve(
-        estimate.covariance[fix][:, axes[:, None], axes], errors[..., None])[..., 0], axis=1)
-    covered = share_percent(int(np.sum(squares <= chdtri(len(axes), 0.05))), max(len(squares), 1))
-    mse = frame.mean_interval(np.sum(errors**2, axis=1))
-    nees, fixes = frame.mean_interval(squares / len(axes)), share_percent(int(fix.sum()), n)
+    figures, is_marked = consistency(errors, estimate.covariance[fix][:, axes[:, None], axes])
+    if walking:
+        of_velocity, is_wrong = consistency(
+            (estimate.velocity - velocities)[fix][:, axes],
+            estimate.velocity_covariance[fix][:, axes[:, None], axes])
+        figures.update({f'velocity_{name}': value for name, value in of_velocity.items()})
+        is_marked |= is_wrong
+    mse, fixes = frame.mean_interval(np.sum(errors**2, axis=1)), share_percent(int(fix.sum()), n)
     return {
-        'about': about(scenario), 'fix': fixes, 'covered': covered, 'nees': nees,
-        'rms_m': mse and [value**0.5 for value in mse],
-        'squares': squares.tolist(), 'fix_ms': fix_ms,
-        'marked': bool(covered[2] < LEAST_COVERED or fixes[2] < LEAST_FIX
-                       or nees is not None and nees[1] > MOST_NEES)}
+        'about': about(scenario), 'fix': fixes, **figures,
+        'rms_m': mse and [value**0.5 for value in mse], 'fix_ms': fix_ms,
+        'marked': is_marked or bool(fixes[2] < LEAST_FIX)}
+
+
+def consistency(errors: np.ndarray, covariances: np.ndarray) -> tuple[dict[str, Any], bool]:
+    """Compare errors [N, D] with covariances [N, D, D]; also return whether they are too large."""
+    squares = np.sum(errors * np.linalg.solve(covariances, errors[..., None])[..., 0], axis=1)
+    n_axes = errors.shape[1]
+    covered = share_percent(int(np.sum(squares <= chdtri(n_axes, 0.05))), max(len(squares), 1))
+    nees = frame.mean_interval(squares / n_axes)
+    return {'covered': covered, 'nees': nees, 'squares': squares.tolist()}, bool(
+        covered[2] < LEAST_COVERED or nees is not None and nees[1] > MOST_NEES)
 
 
 def about(scenario: Scenario) -> str:
@@ -144,7 +194,7 @@ def about(scenario: Scenario) -> str:
         f'elements {rows} x {columns}',
         'region {:.3g} x {:.3g} x {:.3g} m'.format(*scenario.roi_size_m),
         f'multipath {scenario.multipath_to_los_db:g} dB']
-    return ', '.join(words + [f'{name} {value:.3g}' for name in UNKNOWN
+    return ', '.join(words + [f'{name} {value:.3g}' for name in ('user_speed_std_mps', *UNKNOWN)
                               if (value := getattr(scenario, name))])
 
 

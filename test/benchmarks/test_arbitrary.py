@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 from benchmarks import arbitrary
 
+from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
+from rhs_isac_ros.model.geometry import frames_s, movement_warning
+
 
 def test_every_seed_draws_another_valid_scenario():
     scenarios = [arbitrary.draw(np.random.default_rng(seed)) for seed in range(60)]
@@ -22,6 +25,26 @@ def test_a_row_is_marked_if_chance_does_not_explain_it(monkeypatch):
     assert '2.7 GHz, 1 x 4 x 6' in figures['about']
     monkeypatch.setattr(arbitrary, 'MOST_NEES', figures['nees'][1] / 2)
     assert arbitrary.measure(2, 8)['marked']
+
+
+def test_walking_users_move_by_up_to_a_part_of_the_range():
+    ways = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        at_rest = arbitrary.draw(rng)
+        scenario = arbitrary.with_velocity(at_rest, rng)
+        assert not movement_warning(scenario)
+        assert scenario.roi_size_m == at_rest.roi_size_m
+        ways.append(scenario.user_speed_std_mps * frames_s(scenario)
+                    * scenario.center_frequencies_hz[0] / SPEED_OF_LIGHT_MPS)
+    assert min(ways) < 0.1
+    assert max(ways) > 10
+
+
+def test_rows_of_walking_users_contain_the_velocity():
+    figures = arbitrary.measure(9, 4, walking=True)
+    assert ', user_speed_std_mps ' in figures['about']
+    assert len(figures['velocity_squares']) == len(figures['squares']) == 4
 
 
 @pytest.mark.parametrize('name', arbitrary.UNKNOWN)
