@@ -110,6 +110,8 @@ TYPES = {
 # Representation identifier of CDR version 1, little endian, and two bytes of options.
 HEADER = b'\0\1\0\0'
 _NANOSECONDS = 10**9
+# The seconds of a stamp have 32 bits.
+_END_S = 2**31
 _NONE = np.empty(0)
 # Position of the frame in a message, which follows the stamp.
 _FRAME = len(HEADER) + 8
@@ -184,9 +186,14 @@ class Codec:
             self, message: Any, frame: str, stamp_ns: int, sender: int, scenario_id: str) -> bytes:
         """Return the bytes of a message, with the given header, sender and scenario id.
 
-        Raises MessageError if a string has no UTF-8 encoding.
+        Raises MessageError if a string has no UTF-8 encoding, or the stamp is out of range.
         """
-        items: list[Any] = [*divmod(stamp_ns, _NANOSECONDS), frame]
+        seconds, nanoseconds = divmod(stamp_ns, _NANOSECONDS)
+        # A stamp may be that of another program, plus a duration.
+        if not -_END_S <= seconds < _END_S:
+            raise MessageError(f'{self._kind.__name__}.header: stamp of {seconds} s, expected '
+                               f'{-_END_S} to {_END_S - 1}')
+        items: list[Any] = [seconds, nanoseconds, frame]
         for name, _, _, encode, _ in self._fields:
             value = getattr(message, name)
             if encode is not None:

@@ -69,7 +69,8 @@ def to_bytes(
     """Serialize a message (CDR) for a publisher of `ros_type`.
 
     The header contains `stamp_ns` and `frame`. `identity`, if given, replaces the fields `sender`
-    and `scenario_id` of the message. Raises MessageError if a string has no UTF-8 encoding.
+    and `scenario_id` of the message. Raises MessageError if a string has no UTF-8 encoding, or the
+    stamp is out of range.
     """
     sender, scenario_id = identity or (message.sender, message.scenario_id)
     return _CODECS[type(message)].encode(message, frame, stamp_ns, sender, scenario_id)

@@ -137,6 +137,16 @@ def test_a_stamp_with_a_second_or_more_of_nanoseconds_is_refused():
         convert.from_bytes(m.Ack, bytes(content))
 
 
+@pytest.mark.parametrize(('stamp_ns', 'second'), [
+    (10**9 * 2**31, 2**31), (-10**9 * 2**31 - 1, -2**31 - 1)])
+def test_a_stamp_that_no_message_can_have_is_refused(stamp_ns, second):
+    with pytest.raises(m.MessageError, match=f'Ack.header: stamp of {second} s, expected -2147'):
+        convert.to_bytes(m.Ack(cycle_id=3, user=7), stamp_ns)
+    inside_ns = stamp_ns - 1 if stamp_ns > 0 else stamp_ns + 1
+    content = convert.to_bytes(m.Ack(cycle_id=3, user=7), inside_ns)
+    assert convert.from_bytes(m.Ack, content).stamp_ns == inside_ns
+
+
 @pytest.mark.parametrize('kind', KINDS)
 def test_arrays_are_sent_in_c_order_whatever_their_layout(kind):
     message = random_message(kind, np.random.default_rng(0))

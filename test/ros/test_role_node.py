@@ -90,9 +90,12 @@ def test_many_malformed_messages_do_not_fill_the_log(bench, start, probe, capfd)
 def test_an_invalid_message_of_the_role_is_not_published(each_bench, start, capfd):
     bad = m.FeedSignals(cycle_id=1, user=1, band=0, signals=NAN)
     surrogate = m.NoFix(cycle_id=1, user=1, codebook_id='', reason='\ud800')
+    # The latest stamp, as of pilots without a time, and the time until the middle of the cycle.
+    late = feed_signals(stamp_ns=10**9 * 2**31)
     good = feed_signals(user=2)
     role = Scripted(
-        lambda role, event, now_s: [Send(bad), Send(bad), Send(surrogate), Send(good)],
+        lambda role, event, now_s: [
+            Send(bad), Send(bad), Send(surrogate), Send(late), Send(good)],
         sends=[m.FeedSignals, m.NoFix])
     node = start(each_bench, role)
     received = each_bench.collect(each_bench.add(Node, 'probe'), m.FeedSignals)
@@ -102,6 +105,7 @@ def test_an_invalid_message_of_the_role_is_not_published(each_bench, start, capf
     log = capfd.readouterr().err
     assert log.count('not sent: FeedSignals.signals: not finite') == 1
     assert log.count("not sent: NoFix.reason: '\\ud800', expected valid Unicode") == 1
+    assert log.count('not sent: FeedSignals.header: stamp of 2147483648 s') == 1
     assert '[ERROR]' in log
 
 
