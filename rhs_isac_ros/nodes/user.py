@@ -139,7 +139,7 @@ def follow_odometry(
             mobility.reject(f'orientation: {error}')
             return
         # The velocity is in the frame of the robot.
-        mobility.put(Time.from_msg(message.header.stamp).nanoseconds,
+        mobility.put(convert.nanoseconds(message.header.stamp),
                      vector(message.pose.pose.position),
                      rotation @ vector(message.twist.twist.linear))
     # Drivers and simulators often publish best effort.
@@ -173,7 +173,7 @@ def follow_frame(
         if not source or not (buffer := source[0]).can_transform(frame, child, Time()):
             return _ABSENT_S
         found = buffer.lookup_transform(frame, child, Time())
-        stamp_ns = Time.from_msg(found.header.stamp).nanoseconds
+        stamp_ns = convert.nanoseconds(found.header.stamp)
         position = vector(found.transform.translation)
         before_ns, before = last[0] if last else (stamp_ns, position)
         if last and stamp_ns == before_ns:

@@ -120,6 +120,11 @@ def to_ros(kind: Any, numbers: np.ndarray) -> Any:
     return kind(**dict(zip('xyzw', numbers.tolist(), strict=False)))
 
 
+def nanoseconds(stamp: Time) -> int:
+    """Return any stamp [ns]; a time of rclpy cannot be negative, but a stamp can."""
+    return 10**9 * int(stamp.sec) + int(stamp.nanosec)
+
+
 def stamp_of(message: Message | PublishTrack, node: Any) -> Time:
     """Return the stamp of a message, or the current time of a node if the stamp is unknown."""
     if not message.stamp_ns:

@@ -119,6 +119,21 @@ def test_odometry_is_read_in_the_frame_of_the_robot(bench):
     np.testing.assert_allclose(mobility.state(0.0)[1], [0.0, 2.0, 0.0], atol=1e-12)
 
 
+@pytest.mark.parametrize('second', [-2**31, -1, 2**31 - 1])
+def test_odometry_with_any_stamp_is_compared_with_the_clock(bench, second):
+    node = bench.add(Node_, 'robot_user')
+    publisher = bench.add(Node_, 'robot').create_publisher(Odometry, 'odom', 10)
+    mobility = follow_odometry(node, 'map', Pose(), 'odom', 60.0)
+    message = Odometry()
+    message.header.frame_id, message.header.stamp.sec = topics.MAP_FRAME, second
+    message.header.stamp.nanosec = 999_999_999
+
+    def lack():
+        publisher.publish(message)
+        return mobility.lack
+    bench.until(lambda: 'its stamps differ from the clock of this node' in lack(), 'the reason')
+
+
 @pytest.mark.parametrize('refused', ['Buffer', 'TransformListener'])
 def test_transforms_that_were_refused_are_lacking(bench, monkeypatch, refused):
     def refuse(*_, **__):
