@@ -58,8 +58,8 @@ def log_evidence(sightings: Sequence[Sighting], log_shares: Sequence[float],
                  bounds_m: np.ndarray) -> float:
     """Return the logarithm of the evidence outside, relative to the averages inside.
 
-    The region has the bounds [2, 3] [m]. `log_shares` are the logarithms of its probability among
-    positions in the region of each surface.
+    The region has the bounds [2, 3] [m]. `log_shares` are the logarithms of the probability of the
+    smallest box around it, among positions in the region of each surface.
     """
     factors = [_factor(one, log_share, bounds_m)
                for one, log_share in zip(sightings, log_shares, strict=True)]
@@ -88,7 +88,7 @@ def _factor(sighting: Sighting, log_share: float, bounds_m: np.ndarray) -> _Fact
     places, log_seen = sighting.places, float(np.log1p(-sighting.missing))
     rows = Mixture._make((np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3))))
     if places is None:
-        # In the part of the region of the surface that is outside of that of the site.
+        # Or in the part of the region of the surface that is not around that of the site.
         log_rest = float(np.logaddexp(np.nan_to_num(sighting.outside_log_ratio), np.log(
             max(-np.expm1(log_share), _LEAST))))
     else:

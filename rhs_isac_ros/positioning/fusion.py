@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rhs_isac_ros.model.arrays import checked_bounds, log_size, log_sum, mixture_weights
+from rhs_isac_ros.model.arrays import checked_bounds, log_sum, mixture_weights
 from rhs_isac_ros.model.gaussian import likelihood_loss, moments, step_to_maximum, symmetric
 from rhs_isac_ros.model.geometry import polar_derivative, to_positions
 from rhs_isac_ros.model.pose import Pose
@@ -83,8 +83,8 @@ _FAR = -12.0
 _TAIL = -9.0
 # Smallest logarithm of an average, relative to that of the constant.
 _LEAST = -10.0
-# Smallest extent of a region in its volume [m].
-_EXTENT_M = 1e-3
+# Tolerance of the comparison of positions with a region [m].
+_TOLERANCE_M = 1e-3
 _AT_SURFACE = Pose()
 
 
@@ -172,7 +172,8 @@ class _Factor(NamedTuple):
     pose: Pose
     rows: Rows
     moments: Mixture  # Averages and moments inside the region, in the frame of the site.
-    log_share: float  # Logarithm of the surface's probability of the region of the site.
+    # Logarithm of the surface's probability of the smallest box around the region of the site.
+    log_share: float
     thickness: float  # Decreases with the median information about the range.
 
     @classmethod
@@ -207,16 +208,18 @@ class _Factor(NamedTuple):
         near = frames.to_site(to_positions(points))
         gaussians = sheets.inside(boxes, frames, near)
         positions, log_ratio = gaussians.sample(standard_normal(_OF_SHEET))
-        inside, _ = _moments(positions, gaussians.logarithm(positions) + log_ratio)
+        logs = gaussians.logarithm(positions) + log_ratio
+        inside, _ = _moments(positions, logs)
         return [cls._of(
-            one, region_m, bounds_m, points[rows], select(sheets, rows), select(inside, rows),
-            log_sum(inside.log_weights[n:][rows])) for one, region_m, rows in zip(
-                sightings, of_surface, of_sighting.slices, strict=True)]
+            one, bounds_m, points[rows], select(sheets, rows), select(inside, rows),
+            log_sum(inside.log_weights[n:][rows]),
+            _log_share(logs[n:][rows], positions[n:][rows], _smallest_box(bounds_m, one.pose)))
+            for one, rows in zip(sightings, of_sighting.slices, strict=True)]
 
     @classmethod
-    def _of(cls, sighting: Sighting, region_m: np.ndarray, bounds_m: np.ndarray,
-            points: np.ndarray, sheets: Sheets, inside: Mixture, log_mass: float) -> '_Factor':
-        """Take sheets inside the region, and the mass in the region of the surface."""
+    def _of(cls, sighting: Sighting, bounds_m: np.ndarray, points: np.ndarray, sheets: Sheets,
+            inside: Mixture, log_mass: float, log_share: float) -> '_Factor':
+        """Take sheets inside the region, and mass and share in the region of the surface."""
         pose, kept = sighting.pose, np.flatnonzero(_has_mass(inside))
         sheets, inside = select(sheets, kept), select(inside, kept)
         curvature = np.linalg.inv(sheets.covariances)
@@ -246,9 +249,7 @@ class _Factor(NamedTuple):
                 np.append(inside.log_weights - log_total, np.log(sighting.missing)),
                 np.append(inside.means, centre[None], axis=0),
                 np.append(inside.covariances, regular(np.diag(size**2 / 12))[None], axis=0))),
-            # The region of the site may have no extent along an axis, and that of the surface one.
-            min(log_average + log_size(bounds_m, _EXTENT_M)
-                - log_size(region_m, _EXTENT_M), 0.0),
+            log_share if sighting.sheets else min(log_average, 0.0),
             -statistics.median([*curvature[:, 0, 0].tolist(), 0.0]))
 
     def term(self, chosen: np.ndarray) -> Term:
@@ -486,6 +487,17 @@ class _Parts(NamedTuple):
 def _terms(factors: Sequence[_Factor], rows: np.ndarray) -> list[Term]:
     """Return the factors of products of the given rows, int [T, number of factors]."""
     return [one.term(chosen) for one, chosen in zip(factors, rows.T, strict=True)]
+
+
+def _log_share(logs: np.ndarray, positions: np.ndarray, bounds_m: np.ndarray) -> float:
+    """Return the logarithm of the share of samples [T, S, 3] [m] with log-weights [T, S] in a box.
+
+    Errors of the pose are no part of it. They lower the density in a region without extent along
+    an axis, which is no evidence for a user elsewhere.
+    """
+    inside = np.all((positions >= bounds_m[0] - _TOLERANCE_M) & (
+        positions <= bounds_m[1] + _TOLERANCE_M), axis=2)
+    return log_sum(np.where(inside, logs, _NEVER).ravel()) - log_sum(logs.ravel())
 
 
 def _has_mass(mixture: Mixture) -> np.ndarray:

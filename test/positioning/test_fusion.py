@@ -467,5 +467,18 @@ def test_a_user_in_the_region_of_the_site_is_likelier_the_larger_that_of_the_sur
         assert found == pytest.approx(1 / (1 + ratio * np.exp(-1)), abs=0.01)
 
 
+@pytest.mark.parametrize('pose', [
+    FRONT, dataclasses.replace(FRONT, quaternion=(np.sin(0.3), 0.0, 0.0, np.cos(0.3)))],
+    ids=['along an axis', 'turned'])
+def test_the_error_of_a_pose_is_no_evidence_for_a_user_beside_a_line(pose):
+    """The surface sees users beside the line in its own frame, which is no region elsewhere."""
+    line = np.array([[10.0, -5.0, 0.4], [10.0, 5.0, 0.4]])
+    exact = sheets(pose, [10.0, 1.5, 0.4], std=STD / 10)
+    one = dataclasses.replace(
+        exact, pose=dataclasses.replace(pose, uncertainty=(0.05, 0.0)), sheets=exact.likelihood,
+        outside_log_ratio=-20.0)
+    assert fuse([one], line, 0.5).outside_probability < 1e-6
+
+
 def test_users_are_inside_if_no_surface_knows_about_users_outside():
     assert np.isnan(outside_probability(np.nan, np.nan))

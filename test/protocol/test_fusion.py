@@ -100,7 +100,7 @@ def small_site():
 
 
 @pytest.mark.parametrize(('place', 'seed', 'fix'), [
-    ((4.0, -2.4, -1.0), 1, False), ((13.1, -6.3, 0.8), 13, False), ((14.5, -4.5, 0.5), 20, True)])
+    ((4.0, -2.4, -1.0), 1, False), ((13.1, -6.3, 0.8), 13, False), ((7.6, 3.3, -1.0), 1116, True)])
 def test_messages_decide_as_the_library_whether_surfaces_see_a_user_outside_at_one_place(
         small_site, place, seed, fix):
     site, estimator = small_site
