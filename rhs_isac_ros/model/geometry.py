@@ -229,6 +229,16 @@ def polar_bounds(bounds: np.ndarray) -> np.ndarray:
     return limits
 
 
+def seen_bounds(scenario: Scenario) -> np.ndarray:
+    """Return the bounds of the region in which a surface sees users of a site, [2, 3] [m].
+
+    They include errors of the pose; see `Pose.seen`. With a measured covariance of the multipath,
+    which belongs to a region, they are those of the region of interest.
+    """
+    bounds_m = scenario.roi_bounds_m
+    return scenario.pose.seen(bounds_m) if scenario.multipath is None else bounds_m
+
+
 def region_information(scenario: Scenario) -> np.ndarray:
     """Return the information of a Gaussian prior as wide as the region, float64 [3, 3] [1/m^2].
 

@@ -17,6 +17,9 @@ from rhs_isac_ros.model.arrays import cross, numbers, read_only, to_tuples
 
 # Smallest eigenvalue of a covariance relative to the largest one, up to rounding.
 _MIN_EIGENVALUE = -1e-9
+# Reach of errors in standard deviations, and largest share of the distance to a region by which
+# they widen it.
+_REACH, _NEARER = 3.0, 0.5
 # Shapes of the fields.
 _SHAPES: tuple[Sequence[tuple[int, ...]], ...] = [(3,)], [(4,)], [(2,), (6, 6)]
 
@@ -135,6 +138,20 @@ class Pose:
         turns = -_cross_matrices(positions - self.origin)
         by_error = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=-1)
         return by_error @ self.covariance @ np.swapaxes(by_error, -1, -2)
+
+    def seen(self, bounds_m: np.ndarray) -> np.ndarray:
+        """Return the bounds of a region in which a surface with the errors of the pose sees users.
+
+        Bounds are float64 [2, 3] [m], in the frame of the surface. Where the region is thinner
+        than three standard deviations of the errors on either side, the result is as thick as
+        these: a user on a plane or a line of the site is beside it if the pose is off.
+        """
+        corners = np.stack(np.meshgrid(*bounds_m.T), axis=-1).reshape(-1, 3)
+        covariances = self.covariances_to_surface(self.spread(self.to_site(corners)))
+        reach = _REACH * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).max(axis=0))
+        margin = np.maximum(reach - np.ptp(bounds_m, axis=0) / 2, 0.0)
+        margin[0] = min(margin[0], max(_NEARER * bounds_m[0, 0], 0.0))
+        return bounds_m + [-margin, margin]
 
     def scatter(self, positions: np.ndarray) -> np.ndarray:
         """Return `spread` to second order: the mean squares of errors of positions [..., 3].

@@ -13,6 +13,7 @@ import numpy as np
 from rhs_isac_ros.model import MeasurementModel, Pose
 from rhs_isac_ros.model.arrays import blocks, log_size, mixture_weights
 from rhs_isac_ros.model.gaussian import UnknownLevel, share_of_level
+from rhs_isac_ros.model.geometry import seen_bounds
 from rhs_isac_ros.positioning import prior as priors
 from rhs_isac_ros.positioning.alternatives import (
     Alternative,
@@ -96,7 +97,8 @@ class SearchEstimator(abc.ABC):
         prior, it rarely is.
     left_out
         Largest share of the posterior of modes that are left out, from 1e-12 to
-        `MISS_PROBABILITY`; less if other surfaces may favour them.
+        `MISS_PROBABILITY`; less for a surface of a site, if other surfaces may favour them. The
+        region is then that of `geometry.seen_bounds`.
     """
 
     averages = True  # Whether positions are averages over the posterior.
@@ -106,6 +108,8 @@ class SearchEstimator(abc.ABC):
             self, system: System, table_folder: str | Path | None = None, *,
             reject_outside: bool = False, progress: Callable[[float], None] | None = None,
             lazy: bool = False, left_out: float = MISS_PROBABILITY) -> None:
+        if left_out < MISS_PROBABILITY:
+            system = _in_site(system)
         self.system, self.scenario = system, (scenario := system.scenario)
         self._likelihood = likelihood = Likelihood(system)
         self._rejects_outside = reject_outside and bool(scenario.outside_probability)
@@ -522,6 +526,16 @@ class MlEstimator(SearchEstimator):
             samples.of_shot.first(modes.points), samples.of_shot.first(modes.values))[0]
         offsets = best - mean
         return best, regular(covariance + offsets[:, :, None] * offsets[:, None])
+
+
+def _in_site(system: System) -> System:
+    """Return the surface with the region in which it sees users of a site."""
+    scenario = system.scenario
+    if np.array_equal(bounds_m := seen_bounds(scenario), scenario.roi_bounds_m):
+        return system
+    return System(dataclasses.replace(
+        scenario, roi_center_m=bounds_m.mean(axis=0), roi_size_m=np.ptp(bounds_m, axis=0)),
+        system.codebook, system.surface)
 
 
 class _Searched(NamedTuple):

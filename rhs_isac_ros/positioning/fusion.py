@@ -158,9 +158,9 @@ class Fuser:
 
 
 def _smallest_box(bounds_m: np.ndarray, pose: Pose) -> np.ndarray:
-    """Return the bounds of the smallest box in the frame of a surface that contains a box."""
+    """Return the bounds of the smallest box in which a surface sees users of a region."""
     corners = pose.to_surface(np.stack(np.meshgrid(*bounds_m.T), axis=-1).reshape(-1, 3))
-    return np.stack([corners.min(axis=0), corners.max(axis=0)])
+    return pose.seen(np.stack([corners.min(axis=0), corners.max(axis=0)]))
 
 
 class _Factor(NamedTuple):

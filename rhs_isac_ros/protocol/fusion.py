@@ -9,6 +9,7 @@ import numpy as np
 
 from rhs_isac_ros.bounds import site_crlb
 from rhs_isac_ros.model.arrays import log_size
+from rhs_isac_ros.model.geometry import seen_bounds
 from rhs_isac_ros.positioning import Estimate, Mixture, Sighting
 from rhs_isac_ros.positioning.agreement import PoseTest, pair_agreements
 from rhs_isac_ros.positioning.alternatives import LIMIT, Outside
@@ -221,7 +222,7 @@ class Fusion(Role):
             return
         begin = self._stopwatch()
         sightings = {name: dataclasses.replace(
-            sighting_of(one), region_m=self._surfaces[name].scenario.roi_bounds_m)
+            sighting_of(one), region_m=seen_bounds(self._surfaces[name].scenario))
             for name, one in fix.posteriors.items()}
         # Anything may be published on the topic, such as a mixture inside the surface.
         fuser = Fuser(self._bounds_m, *self._users)
@@ -265,7 +266,7 @@ class Fusion(Role):
             crlb_m2=self._bound_m2(answers, fused.mean),
             estimator=f'fusion of {", ".join(answers)}', latency_s=latency_s, **common))
         # The agreement is relative to a different user in the region of each surface.
-        averages = (one.log_evidence - log_size(self._surfaces[name].scenario.roi_bounds_m)
+        averages = (one.log_evidence - log_size(seen_bounds(self._surfaces[name].scenario))
                     for name, one in answers.items())
         log_evidence = float(fused.log_agreement) + log_size(self._bounds_m) + sum(averages)
         missing = math.prod(one.missing for one in sightings.values())

@@ -120,6 +120,22 @@ def test_a_turn_also_moves_positions_along_the_line_of_sight_to_second_order():
         np.trace(found, axis1=1, axis2=2), np.mean(np.sum(offsets**2, axis=2), axis=0), rtol=0.05)
 
 
+def test_a_surface_sees_users_of_a_thin_region_beside_it():
+    box = np.array([[4.0, -3.0, 1.0], [6.0, 3.0, 1.0]])
+    pose = Pose(SIDE.position_m, SIDE.quaternion, (0.1, 0.0))
+    seen = pose.seen(box)
+    # Along other axes, the errors are small in comparison.
+    np.testing.assert_array_equal(seen[:, :2], box[:, :2])
+    users = SIDE.to_surface(pose.displaced([0.0, 0.0, 0.25, 0.0, 0.0, 0.0]).to_site(box))
+    assert (seen[0, 2] < users[:, 2]).all() and (users[:, 2] < seen[1, 2]).all()
+    np.testing.assert_allclose(seen[:, 2], [0.7, 1.3])
+    np.testing.assert_allclose(Pose(uncertainty=(0.0, 1.0)).seen(box)[1, 2] - 1.0, 3 * np.radians(
+        np.linalg.norm(box[1, :2])), rtol=1e-6)
+    np.testing.assert_array_equal(Pose(uncertainty=(0.0, 0.0)).seen(box), box)
+    # No user is behind the surface.
+    assert pose.seen(np.array([[0.2, -3.0, 1.0], [0.2, 3.0, 1.0]]))[0, 0] == pytest.approx(0.1)
+
+
 def test_the_errors_of_a_pose_turn_velocities():
     turned = Pose(uncertainty=np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 1e-4]))
     np.testing.assert_allclose(turned.spread_of_vectors(np.array([2.0, 0.0, 0.0])),

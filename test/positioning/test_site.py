@@ -105,6 +105,23 @@ def test_users_outside_have_no_position_and_users_inside_have_one(estimator, loc
                for reason, fix in zip(found.reason, found.fix, strict=True) if not fix)
 
 
+def test_users_on_a_plane_have_a_position_if_the_pose_is_off_as_declared():
+    plane, pose = BOUNDS * [1.0, 1.0, 0.0], Pose(uncertainty=(0.1, 0.0))
+    quick = dataclasses.replace(
+        Scenario.from_yaml(CONFIG / 'quick.yaml'), roi_size_m=(10.0, 10.0, 0.0),
+        multipath_to_los_db=-30.0, outside_probability=0.25, pose=pose)
+    system = System(quick, Codebook.load(CONFIG / 'codebook_quick.yaml'))
+    rng, moved = np.random.default_rng(1), pose.displaced([0.0, 0.0, 0.15, 0.0, 0.0, 0.0])
+    users = rng.uniform(*plane, size=(20, 3))
+    found = SiteEstimator(Site({'front': system}, plane)).estimate(
+        {'front': system.sample(moved.to_surface(users), rng)})
+    assert found.fix.all()
+    np.testing.assert_array_equal(found.mean[:, 2], 0.0)
+    errors = (found.mean - users)[:, :2]
+    squares = np.einsum('ni,nij,nj->n', errors, np.linalg.inv(found.covariance[:, :2, :2]), errors)
+    assert squares.max() < 20
+
+
 def test_the_example_is_two_surfaces_at_a_right_angle():
     site = Site.from_yaml(CONFIG / 'site.yaml')
     assert list(site.surfaces) == ['front', 'side']
