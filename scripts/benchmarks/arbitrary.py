@@ -18,6 +18,9 @@ With `--walking`, users move by 0.01 to 30 wavelengths in a cycle, but not by mo
 shortest range, with standard deviations that the scenario declares; up to 32 frames, and times to
 retune, are drawn as well. A row then also contains the velocity, and is marked if its limits are
 exceeded.
+
+With `--surfaces`, others with scenarios of their own are at random places around the region, as in
+a site. For each user, their poses are off as declared.
 """
 
 import dataclasses
@@ -27,14 +30,15 @@ from typing import Any
 
 import numpy as np
 from parts import frame
+from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from rhs_isac_ros.codebook import random_codebook
 from rhs_isac_ros.experiments.resampling import share_percent
-from rhs_isac_ros.model import Scenario
+from rhs_isac_ros.model import Pose, Scenario
 from rhs_isac_ros.model.constants import SPEED_OF_LIGHT_MPS
 from rhs_isac_ros.model.geometry import polar_bounds, velocity_std_mps
-from rhs_isac_ros.positioning import make_estimator
+from rhs_isac_ros.positioning import Site, SiteEstimator, make_estimator
 from rhs_isac_ros.support.arguments import integer
 from rhs_isac_ros.system import System
 
@@ -51,13 +55,16 @@ def main() -> None:
     parser.add_argument('--first', type=integer(0, 10**9), default=0, help='first seed')
     parser.add_argument('--scenarios', type=integer(1, 10**6), default=40,
                         help='number of scenarios')
-    parser.add_argument('--walking', action='store_true',
-                        help='users walk in a cycle, with a declared velocity')
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument('--walking', action='store_true',
+                       help='users walk in a cycle, with a declared velocity')
+    kinds.add_argument('--surfaces', type=integer(1, 8), default=1,
+                       help='number of surfaces around the region')
     options = parser.parse_args()
     seeds = range(options.first, options.first + options.scenarios)
     results = frame.measured(options, 'arbitrary', measure, {
-        str(one): {'seed': one, 'n': options.positions, 'walking': options.walking}
-        for one in seeds})
+        str(one): {'seed': one, 'n': options.positions, 'walking': options.walking,
+                   'n_surfaces': options.surfaces} for one in seeds})
     table = frame.Table(['seed', 'scenario', ''], {
         'fix [%]': ('fix', 1), 'in the 95 % region [%]': ('covered', 1), 'NEES': ('nees', 2),
         'error [m]': ('rms_m', 3), **({
@@ -142,22 +149,55 @@ def with_velocity(at_rest: Scenario, rng: np.random.Generator) -> Scenario:
         carrier_offset_std_hz=(rng.uniform() < 0.2) * between(0.01, 1.0) / cycle_s)
 
 
-def measure(seed: int, n: int, walking: bool = False) -> dict[str, Any]:
+def placed(scenario: Scenario, bounds_m: np.ndarray, rng: np.random.Generator) -> Scenario:
+    """Move a surface to any side of a region of a site, which it faces, though not exactly."""
+    distance_m = np.linalg.norm(np.ptp(bounds_m, axis=0)) / 2 * rng.uniform(1.5, 4.0)
+    sight = Rotation.from_euler('ZY', [rng.uniform(-np.pi, np.pi), rng.uniform(-0.5, 0.5)])
+    facing = sight * Rotation.from_euler('ZYX', rng.uniform(-0.3, 0.3, 3))
+    pose = Pose(tuple(bounds_m.mean(axis=0) - distance_m * sight.apply([1.0, 0.0, 0.0])),
+                tuple(facing.as_quat()))
+    corners = pose.to_surface(np.stack(np.meshgrid(*bounds_m.T), axis=-1).reshape(-1, 3))
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    # The signals are as strong as they were drawn.
+    nearer = distance_m / np.linalg.norm(scenario.roi_center_m)
+    return dataclasses.replace(
+        scenario, pose=pose, roi_center_m=tuple((low + high) / 2),
+        roi_size_m=tuple(high - low), max_power_w=scenario.max_power_w * nearer**2)
+
+
+def in_sight(system: System) -> System:
+    """Return a surface whose users have a direct path."""
+    return System(dataclasses.replace(system.scenario, blocked_probability=0.0), system.codebook)
+
+
+def signals_of(system: System, positions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw signals of users at positions of the site; for each, the pose is off as declared."""
+    return in_sight(system).sample(np.stack([system.pose.displaced(rng.multivariate_normal(
+        np.zeros(6), system.pose.covariance)).to_surface(place) for place in positions]), rng)
+
+
+def measure(seed: int, n: int, walking: bool = False, n_surfaces: int = 1) -> dict[str, Any]:
     """Measure the scenario of a seed with n positions."""
     rng = np.random.default_rng(seed)
     scenario = draw(rng)
     if walking:
         scenario = with_velocity(scenario, rng)
-    codebook = random_codebook(scenario, rng)
+    system = System(scenario, random_codebook(scenario, rng))
+    site = {'first': system}
+    for number in range(1, n_surfaces):
+        other = placed(draw(rng), scenario.roi_bounds_m, rng)
+        site[f'other_{number}'] = System(other, random_codebook(other, rng))
     # Positions of users without a direct path have no error to measure.
-    emulated = System(dataclasses.replace(scenario, blocked_probability=0.0), codebook)
-    positions, received = emulated.pairs(n, seed)
+    positions, received = in_sight(system).pairs(n, seed)
     velocities = velocity_std_mps(scenario) * rng.standard_normal((n, 3))
     if walking:
-        received = emulated.sample(np.hstack([positions, velocities]), rng)
-    estimator = make_estimator('bayes', scenario, codebook)
+        received = in_sight(system).sample(np.hstack([positions, velocities]), rng)
+    locate = make_estimator('bayes', scenario, system.codebook).estimate
+    if n_surfaces > 1:
+        locate = SiteEstimator(Site(site, scenario.roi_bounds_m)).estimate
+        received = {name: signals_of(one, positions, rng) for name, one in site.items()}
     begin_s = time.process_time()
-    estimate = estimator.estimate(received)
+    estimate = locate(received)
     fix_ms = 1e3 * (time.process_time() - begin_s) / n
     axes, fix = np.flatnonzero(scenario.roi_size_m), np.asarray(estimate.fix)
     errors = (estimate.mean - positions)[fix][:, axes]
@@ -170,7 +210,7 @@ def measure(seed: int, n: int, walking: bool = False) -> dict[str, Any]:
         is_marked |= is_wrong
     mse, fixes = frame.mean_interval(np.sum(errors**2, axis=1)), share_percent(int(fix.sum()), n)
     return {
-        'about': about(scenario), 'fix': fixes, **figures,
+        'about': '; '.join(about(one.scenario) for one in site.values()), 'fix': fixes, **figures,
         'rms_m': mse and [value**0.5 for value in mse], 'fix_ms': fix_ms,
         'marked': is_marked or bool(fixes[2] < LEAST_FIX)}
 

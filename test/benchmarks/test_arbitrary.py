@@ -47,6 +47,24 @@ def test_rows_of_walking_users_contain_the_velocity():
     assert len(figures['velocity_squares']) == len(figures['squares']) == 4
 
 
+def test_all_surfaces_of_a_site_face_its_region():
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        bounds_m = arbitrary.draw(rng).roi_bounds_m
+        other = arbitrary.placed(arbitrary.draw(rng), bounds_m, rng)
+        low, high = other.roi_bounds_m
+        assert low[0] > 0
+        places = other.pose.to_surface(rng.uniform(*bounds_m, (10, 3)))
+        assert (low - 1e-9 <= places).all() and (places <= high + 1e-9).all()
+
+
+def test_several_surfaces_locate_the_users_of_one_region():
+    figures = arbitrary.measure(5, 8, n_surfaces=2)
+    assert figures['about'].count('GHz') == 2
+    assert figures['fix'][0] == 100
+    assert 0.2 < figures['nees'][0] < 3
+
+
 @pytest.mark.parametrize('name', arbitrary.UNKNOWN)
 def test_descriptions_name_what_is_unknown(name):
     scenario = arbitrary.draw(np.random.default_rng(9))
