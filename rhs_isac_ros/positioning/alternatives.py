@@ -53,6 +53,8 @@ _MIN_DOUBT = 0.01
 _STEPS = 2
 _REACH = 2.0
 _CURVATURE = 0.5
+# Further steps with twice the differences, where the curvature is below the least one.
+_WIDER, _WIDENINGS = 2.0, 4
 # Absolute log odds of an alternative up to which its evidence may count, before and after the
 # first step, and a step after which the curvature hardly changes.
 _NEAR = 30.0
@@ -270,22 +272,28 @@ def log_ratios_of(
 
     found, log_volume = ratios(values), np.zeros(len(values))
     (near,) = np.nonzero(np.abs(alternative.log_odds + found) < _NEAR)
-    around = np.concatenate([-axes, axes])
-    for _ in range(_STEPS):
+    # Places outside may differ in what a parameter changes, such as the delay, which the signals
+    # then determine less than the multipath alone would.
+    scales = np.ones((len(values), len(axes)))
+    for _ in range(_STEPS + _WIDENINGS):
         if not len(near):
             break
-        best, at = found[near], values[near]
+        best, at, offsets = found[near], values[near], scales[near][..., None] * axes
+        around = np.concatenate([-offsets, offsets], axis=1)
         low, high = np.split(ratios(
-            (at[:, None] + around).reshape(-1, len(prior)), np.repeat(near, len(around))
+            (at[:, None] + around).reshape(-1, len(prior)), np.repeat(near, 2 * len(axes))
         ).reshape(len(near), -1), 2, axis=1)
-        curvature = np.maximum(2 * best[:, None] - high - low, _CURVATURE)
-        log_volume[near] = -np.log(curvature).sum(axis=1) / 2
+        curvature = 2 * best[:, None] - high - low
+        is_flat = curvature < _CURVATURE
+        curvature = np.maximum(curvature, _CURVATURE)
+        log_volume[near] = (np.log(scales[near]) - np.log(curvature) / 2).sum(axis=1)
         step = np.clip((high - low) / (2 * curvature), -_REACH, _REACH)
-        moved = at + step @ axes
+        moved = at + (step[..., None] * offsets).sum(axis=1)
         there = ratios(moved, near)
         better = there > best
         found[near[better]], values[near[better]] = there[better], moved[better]
-        near = near[(np.abs(step).max(axis=1) >= _CLOSE)
+        scales[near] *= np.where(is_flat, _WIDER, 1.0)
+        near = near[((np.abs(step).max(axis=1) >= _CLOSE) | is_flat.any(axis=1))
                     & (alternative.log_odds + found[near] > -_SURE)]
     whitened = likelihood.whitened(values, signals)
     return with_noise(found + log_volume, whitened), values, whitened

@@ -167,6 +167,32 @@ def test_the_evidence_is_the_average_over_an_unknown_timing(random_beams):
     np.testing.assert_allclose(found, alone, rtol=0, atol=1e-9)
 
 
+def test_the_range_of_a_user_outside_may_explain_what_a_timing_changes(random_beams):
+    """The timing is then less certain than from the multipath alone."""
+    scenario = Scenario(
+        center_frequencies_hz=(3e9,), n_subbands=2, n_frames=1, subband_width_hz=8e6,
+        delay_spread_s=5e-10, elements_per_side=6, multipath_to_los_db=-10.0,
+        roi_center_m=(4, 0, 0), roi_size_m=(2, 2, 1), timing_std_s=3e-8)
+    likelihood = Likelihood(System(
+        scenario, random_beams(scenario, np.random.default_rng(1))))
+    prior, outside = likelihood.nuisance, Outside(scenario, tabulate_outside(likelihood.model))
+    assert len(prior) == 1
+    assert prior.axes[0, 0] < 0.25
+    shots = likelihood.signals(likelihood.model.sample(np.array(
+        [[8.0, 1.0, 0.5], [4.0, 0.5, 0.2], [6.0, -3.0, 1.0], [3.5, 3.0, -1.0]]),
+        np.random.default_rng(7)))
+    values, expected = np.linspace(-4, 4, 401)[:, None], []
+    for shot in range(4):
+        exponent = outside.log_evidence_of(
+            likelihood.whitened(values, select(shots, [shot])), np.zeros_like(values), prior
+        ) - prior.log_evidence_of_aligned(np.zeros(1)) + norm().logpdf(values[:, 0])
+        expected.append(logsumexp(exponent) + np.log(8 / 400))
+    start = np.zeros((4, 1))
+    found, _, _ = log_ratios_of(
+        outside, likelihood, shots, shots.whitened, start, start, np.array(expected))
+    np.testing.assert_allclose(found, 0.0, atol=0.5)
+
+
 @pytest.fixture(scope='module')
 def failing(setting):
     """The likelihood if elements may have failed, their states, and some signals."""
