@@ -20,7 +20,7 @@ def example_message(
         **given: Any) -> m.Message:
     """Return a valid message of a class with zeros or random numbers, or given values.
 
-    Positions are in front of the surface, and symbols have unit magnitude.
+    Positions are in front of the surface, symbols have unit magnitude, and beams little power.
     """
     sizes, values = scenario.sizes, {}
     if kind is m.GroundTruths:
@@ -66,4 +66,6 @@ def example_message(
                 values[field.name][..., 0] += 1
             if field.name == 'symbols':
                 values[field.name] = np.exp(1j * values[field.name])
+            if kind is m.Beam and field.name == 'digital':
+                values[field.name] *= (scenario.max_power_w / np.prod(shape))**0.5
     return kind(**values)

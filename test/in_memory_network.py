@@ -73,7 +73,8 @@ def plain_choice(scenario: Scenario, position: np.ndarray, covariance_m2: np.nda
                  bands: Sequence[int], surface: Any) -> Any:
     """Take the place of `choose_beam`, with a beam that depends on the position alone."""
     angles = np.arange(scenario.n_elements) * np.abs(position).sum()
-    digital = np.full((scenario.n_subbands, scenario.n_feeds), 0.1 + 0j)
+    shape = scenario.n_subbands, scenario.n_feeds
+    digital = np.full(shape, (scenario.max_power_w / np.prod(shape))**0.5 + 0j)
     return types.SimpleNamespace(
         beam=Beamformer(0.5 + 0.5 * np.cos(angles), digital, bands[0]), expected_bps=1e6)
 

@@ -80,7 +80,7 @@ def check(message: 'Message', scenario: Scenario) -> None:
             position_problem(scenario.pose.to_surface(value)) if in_front else '')
         if problem:
             raise MessageError(f'{kind.__name__}.{name}: {problem}')
-    if problem := message.own_problem():
+    if problem := message.own_problem(scenario):
         raise MessageError(f'{kind.__name__}.{problem}')
 
 
@@ -142,6 +142,9 @@ LAST_USER = 2**32 - 1
 # Highest magnitude of the coordinates in a message [m].
 MAX_COORDINATE_M = 1e6
 _MAX_BITS = 1e15
+# Maximum relative excess of the power of a beam, and magnitude that counts as excess [sqrt(W)].
+_POWER_TOLERANCE = 1e-6
+_MAX_MAGNITUDE = 1e9
 
 
 class Mode(enum.IntEnum):
@@ -200,7 +203,7 @@ class Message:
         """Return the sizes that depend on the message itself, by symbol as in `Scenario.sizes`."""
         return {}
 
-    def own_problem(self) -> str:
+    def own_problem(self, scenario: Scenario) -> str:
         """Return the name of an invalid field and what is wrong with it; '' if there is none."""
         return ''
 
@@ -405,7 +408,7 @@ class Posterior(Message):
                 'PLACES': len(self.outside_log_weights),
                 'D': 6 if self.means.shape[1:] == (6,) else 3}
 
-    def own_problem(self) -> str:
+    def own_problem(self, scenario: Scenario) -> str:
         """Describe a mixture without a density, a pose that is none, or means behind it."""
         for fewest, log_weights, covariances in (
                 (1, 'log_weights', 'covariances_m2'),
@@ -455,6 +458,15 @@ class Beam(Message):
     analog: np.ndarray = array('N_E', low=0, high=1)
     digital: np.ndarray = array('N_SB K', complex)
     expected_bps: float = number(0, _MAX_BITS)
+
+    def own_problem(self, scenario: Scenario) -> str:
+        """Return what is wrong with the power of the beam; '' if it is within the limit."""
+        limit_w, magnitudes = scenario.max_power_w, np.abs(self.digital)
+        # Squares of large numbers overflow.
+        power_w = float(np.sum(np.minimum(magnitudes, _MAX_MAGNITUDE)**2))
+        if power_w <= (1 + _POWER_TOLERANCE) * limit_w:
+            return ''
+        return f'digital: power {power_w:g} W, expected at most max_power_w = {limit_w:g} W'
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)

@@ -58,7 +58,7 @@ def test_plates_that_face_along_normals_are_triangles():
 
 def beam(sizes):
     return m.Beam(cycle_id=1, user=1, codebook_id='cb', band=0, analog=np.ones(sizes['N_E']),
-                  digital=np.ones((sizes['N_SB'], sizes['K']), complex), expected_bps=1.0)
+                  digital=np.full((sizes['N_SB'], sizes['K']), 1e-3 + 0j), expected_bps=1.0)
 
 
 def test_users_and_estimates_are_shown_at_their_positions(bench, probe, shown):

@@ -190,6 +190,9 @@ MALFORMED = [
     (m.PositionEstimate, {'covariance_m2': np.eye(3) * 1e13}, 'covariance_m2: 0 to 1e+13'),
     *((m.Posterior, {name: np.full((1, 3), 1e7)}, f'{name}: 1e+07 to 1e+07') for name in (
         'sheet_means', 'outside_means')),
+    # Squares of large numbers would overflow.
+    *((m.Beam, {'digital': sets(size)}, f'power {power} W, expected at most max_power_w = 0.001 W')
+      for size, power in ((0.1, 0.01), (1e300, '1e+18'))),
     (m.GroundTruth, {'position': np.array([5.0, 1j, 0.0])}, 'expected real numbers'),
     (m.GroundTruth, {'position': np.ma.array([5.0, 1.0, 0.0], mask=[0, 1, 0])},
      'expected real numbers'),
