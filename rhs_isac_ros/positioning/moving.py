@@ -30,6 +30,9 @@ _ACROSS = 2.0
 _CANDIDATES = 128
 _STARTS = 80
 _MARGIN = 90.0
+# Largest ratio of successive ranges of starts with an unknown gain, from which the ascent reaches
+# those between them.
+_RATIO = 1.3
 
 
 class _Shell(NamedTuple):
@@ -193,14 +196,17 @@ class MovingTable(TemplateTable):
         chosen = np.argpartition(bound.ravel(), bound.size - n)[bound.size - n:]
         delay, node, speed = np.unravel_index(chosen, amplitude.shape)
         amplitude, inverse = amplitude.ravel()[chosen], inverse.ravel()[chosen]
-        # The range follows from the amplitude, for the median of the gain, and for the gain of
-        # the rest of the signals. In strong signals, this rest is that of the templates.
-        rest = np.maximum(energy - amplitude**2 * inverse, tiny)
-        gain = np.zeros((1, n))
+        # The range follows from the amplitude for the median of the gain.
+        best_m = 1 / np.maximum(amplitude * inverse, tiny)[None]
         if prior.gain_std:
-            gain = np.vstack([gain, prior.maximised_over_gain(0 * rest, rest, n_measurements)[1]])
-        best_m = np.clip(np.exp(gain) / np.maximum(amplitude * inverse, tiny),
-                         shell.nearest_m[delay, node], shell.farthest_m[delay, node])
+            # In weak signals, the rest shows the gain. In strong ones, it is that of templates.
+            rest = np.maximum(energy - amplitude**2 * inverse, tiny)
+            _, gain = prior.maximised_over_gain(0 * rest, rest, n_measurements)
+            ends_m = shell.nearest_m.min(), shell.farthest_m.max()
+            n_ranges = 1 + int(np.log(ends_m[1] / ends_m[0]) / np.log(_RATIO))
+            best_m = np.vstack([best_m, best_m * np.exp(gain), np.multiply.outer(
+                np.geomspace(*ends_m, n_ranges + 2)[1:-1], np.ones(n))])
+        best_m = np.clip(best_m, shell.nearest_m[delay, node], shell.farthest_m[delay, node])
         value, gain = prior.maximised_over_gain(amplitude / best_m, energy, n_measurements)
         value = value - 1 / (inverse * best_m**2) - self._penalty[speed] - (
             shell.squares[hypothesis, node] * best_m**2 / (2 * self._std**2))

@@ -83,8 +83,9 @@ def test_positions_and_velocities_are_in_their_regions(walking):
 
 @pytest.mark.parametrize('changes', [
     dict(roi_center_m=(2.5, -2, 0), roi_size_m=(0, 2, 0)),
-    dict(roi_center_m=(4, 0, -2), roi_size_m=(4, 2, 0), user_gain_std_db=6.0)],
-    ids=['line', 'gain'])
+    dict(roi_center_m=(4, 0, -2), roi_size_m=(4, 2, 0), user_gain_std_db=6.0),
+    dict(roi_center_m=(10, -0.4, 0.4), roi_size_m=(6, 0, 0), user_gain_std_db=6.0,
+         frame_duration_s=2e-3)], ids=['line', 'gain', 'gain on a line ahead'])
 def test_strong_signals_are_found_wherever_users_can_be(changes):
     """Where users cannot have all rates or ranges, starts have those that they can have."""
     system, rng = system_of(multipath_to_los_db=-20, **changes), np.random.default_rng(7)
