@@ -257,8 +257,9 @@ def log_ratios_of(
     axes = prior.axes
 
     def with_noise(found: np.ndarray, seen: np.ndarray) -> np.ndarray:
-        for n in np.flatnonzero(
-                np.abs(alternative.log_odds + found) < _SURE * bool(prior.gain_std)):
+        # If a gain without a prior scaled the noise, evidences would be arbitrarily wrong.
+        limit = _SURE * prior.gain_std / (prior.gain_unit or 1.0)
+        for n in np.flatnonzero(np.abs(alternative.log_odds + found) < limit):
             found[n] += alternative.noise_ratio(seen[n], likelihood)
         return found
 

@@ -323,6 +323,7 @@ def assemble(prior: NuisancePrior, values: np.ndarray, columns: Columns,
         value += 2 * np.log(weights).sum(axis=1)
         gradient[:, first:n] += 2 * surplus @ prior.gains
         information[:, first:n, first:n] -= prior.hidden(shares)
+        np.maximum(diagonal[:, first:n], prior.least_information, out=diagonal[:, first:n])
     if not n_linear:
         return Local(value, gradient, information, energy)
     marginal = marginalise(information, gradient, n)

@@ -124,6 +124,16 @@ class NuisancePrior(Exponents):
         return self.has_gain * float(np.sqrt(self.gain @ self._gain_variance))
 
     @functools.cached_property
+    def least_information(self) -> np.ndarray:
+        """Information about parameters without a prior that move a gain by a neper, [Q].
+
+        Where noise hides the signals, any lower gain is as likely. Evidences of several hypotheses
+        are then comparable, as each contains an equal part of these gains.
+        """
+        found: np.ndarray = np.where(self.precision < 1, np.mean(self.gains**2, axis=0), 0.0)
+        return found
+
+    @functools.cached_property
     def _gain_variance(self) -> np.ndarray:
         """Covariance of the parameters with the gain of all signals [nepers], float64 [Q]."""
         return self.gain / np.where(self.gain == 0, 1.0, self.precision)

@@ -8,6 +8,7 @@ product over the bands of ``I_0(2 |t_i^H y_i|)``, with templates t_i and signals
 factors are smooth, so a coarse grid suffices.
 """
 
+import functools
 import itertools
 import math
 from collections.abc import Callable, Mapping
@@ -18,6 +19,7 @@ from rhs_isac_ros.model import MeasurementModel, Scenario, gaussian
 from rhs_isac_ros.model.arrays import blocks, evenly_spread, log_sum, marked, mixture_weights
 from rhs_isac_ros.model.geometry import element_positions, to_positions
 from rhs_isac_ros.positioning.dispersed import ONE_STATE, SurfaceState
+from rhs_isac_ros.positioning.gains import GainLikelihoods
 from rhs_isac_ros.positioning.grid import separate
 from rhs_isac_ros.positioning.lattice import Resolution, carrier_wavenumbers
 from rhs_isac_ros.positioning.likelihood import Likelihood
@@ -50,11 +52,8 @@ _ERROR = 0.25
 _GAIN_ERROR = 0.01
 # Directions with a log-likelihood below the best by more than this at all ranges are ignored.
 _MARGIN = 20.0
-# Number of places at which noise is taken into account, and largest gain there, in standard
-# deviations and in nepers; largest number of gains: stronger signals are far above the noise.
-_NOISY, _GAIN_REACH, _GAINS = 32, 5.0, 2000
-# Smallest sum of the shares of noise in the measurements that has an effect.
-_LEAST_NOISE = 1.0
+# Number of directions in which noise is taken into account.
+_NOISY = 32
 # Numbers of templates, and of shots, to compute at a time.
 _BLOCK = 512
 _SHOTS = 16
@@ -207,46 +206,39 @@ class OutsideTemplates:
         tolerated = max_residual + _ERROR * self._energy
         return bool(((residual <= tolerated) & np.isfinite(self._offset)).any())
 
-    def noise_ratio(self, whitened: np.ndarray, likelihood: Likelihood) -> float:
-        """Average the ratio over places that are drawn as often as their cells are probable.
+    @functools.cached_property
+    def _prior_of_directions(self) -> np.ndarray:
+        """Prior probabilities of directions, float64 [V]."""
+        return np.exp((self._offset + self._energy).astype(float)).sum(axis=0)
 
-        See `alternatives.Outside.noise_ratio`. The gain is integrated at each place.
+    def noise_ratio(self, whitened: np.ndarray, likelihood: Likelihood) -> float:
+        """Compare averages over directions; see `alternatives.Outside.noise_ratio`.
+
+        Half of the directions are drawn as often as they are probable if the gain scales the
+        noise. The other half is drawn from the prior, as noise may hide the signals.
         """
         prior, noise = likelihood.nuisance, likelihood.factors.noise
-        # Without a prior, all of the mass of a gain would be where noise hides the signals.
-        if (noise is None or noise.sum() < _LEAST_NOISE
-                or prior.gain_std > _GAIN_REACH * prior.gain_unit):
-            return 0.0
-        _, rows, directions, logs, _ = self._cells(whitened[None], prior)
-        shares, _ = mixture_weights(logs)
+        assert noise is not None
+        _, _, directions, logs, _ = self._cells(whitened[None], prior)
+        expected = self._prior_of_directions
+        probable = np.bincount(directions, mixture_weights(logs)[0], minlength=len(expected))
+        drawn_as = (probable + expected) / 2
         drawn = np.minimum(np.searchsorted(
-            np.cumsum(shares), evenly_spread(_NOISY)), len(logs) - 1)
-        rows, directions = rows[drawn], directions[drawn]
-        columns = self._index[rows] * len(self._directions) + directions
-        means = self._filters[:, columns].conj() * (self._scale[rows] / 2)
-        # Spaced by their standard deviation, a sum over gains is as good as an integral.
-        reach = _GAIN_REACH * min(prior.gain_std, 1.0)
-        n_gains = 2 + int(2 * reach * np.sqrt(
-            4 * self._state.energy(whitened) + prior.gain_std**-2))
-        if n_gains > _GAINS:
-            return 0.0
-        gains = np.linspace(-reach, reach, n_gains)
-        factor, ratios = np.exp(-gains)[:, None], []
-        # With the noise as it is, and as if a gain scaled it.
+            np.cumsum(drawn_as), evenly_spread(_NOISY)), len(drawn_as) - 1)
+        drawn, counts = np.unique(drawn, return_counts=True)
+        nodes = np.arange(len(self._node_energy))[:, None]
+        means = self._filters[:, nodes * len(self._directions) + drawn].conj() / 2
+        log_weights = np.log(counts / drawn_as[drawn]) + (
+            self._offset[:, drawn] + self._energy[:, drawn])
+        amplitudes, log_sums = self._scale[:, 0].astype(float), []
         for of_noise in (noise, np.zeros_like(noise)):
-            weights, _ = prior.noise_weights(
-                np.broadcast_to(gains[:, None], (n_gains, len(whitened))), of_noise)
-            squares = (weights**2).reshape(n_gains, *whitened.shape).swapaxes(0, 1)
-            at_means = np.abs(np.matmul(
-                squares, np.swapaxes(means.conj() * whitened[:, None], 1, 2))).sum(axis=0)
-            of_means = np.matmul(squares, np.swapaxes(np.abs(means)**2, 1, 2)).sum(axis=0)
-            of_signals = np.matmul(squares, np.abs(whitened[..., None])**2).sum(axis=0)
-            logs = (factor * (2 * at_means - factor * of_signals) - of_means
-                    + 2 * np.log(weights).sum(axis=1, keepdims=True)
-                    - 2 * whitened.size * gains[:, None]
-                    - gains[:, None]**2 / (2 * prior.gain_std**2))
-            ratios.append(mixture_weights(logs, axis=0)[1])
-        return log_sum(ratios[0] - ratios[1]) - math.log(_NOISY)
+            likelihoods = GainLikelihoods(whitened, means, of_noise, prior.gain_std)
+            gains, values = likelihoods.starts(amplitudes, self._index)
+            values += log_weights
+            ranges, places = marked(values >= values.max() - _MARGIN)
+            log_sums.append(log_sum(log_weights[ranges, places] + likelihoods.log_integrals(
+                self._index[ranges], places, amplitudes[ranges], gains[ranges, places])))
+        return log_sums[0] - log_sums[1]
 
     def places(self, whitened: np.ndarray, prior: NuisancePrior
                ) -> tuple[np.ndarray, np.ndarray, float]:

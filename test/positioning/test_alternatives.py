@@ -276,14 +276,14 @@ def test_templates_outside_fit_a_measured_multipath(pytestconfig):
     assert np.isfinite(anywhere.outside_probability).all()
 
 
-@pytest.mark.parametrize(('range_m', 'noise_dbm_hz'), [
-    (6.0, -135.0), (6.0, -115.0), (12.0, -105.0)])
+@pytest.mark.parametrize(('range_m', 'noise_dbm_hz', 'std_db'), [
+    (6.0, -135.0, 4.0), (6.0, -115.0, 4.0), (12.0, -105.0, 4.0), (6.0, -115.0, np.inf)])
 def test_a_gain_outside_does_not_scale_the_noise(
-        setting, random_beams, range_m, noise_dbm_hz):
+        setting, random_beams, range_m, noise_dbm_hz, std_db):
     """The evidence is the average over users of known gains."""
     scenario = dataclasses.replace(
         setting[0], noise_psd_dbm_hz=noise_dbm_hz, multipath_to_los_db=-6.0,
-        user_gain_std_db=4.0)
+        user_gain_std_db=std_db)
     codebook = random_beams(scenario, np.random.default_rng(0))
     likelihood = Likelihood(System(scenario, codebook))
     known = dataclasses.replace(scenario, user_gain_std_db=0.0)
@@ -296,14 +296,29 @@ def test_a_gain_outside_does_not_scale_the_noise(
         logs.append(Outside(one, tabulate_outside(of_gain.model)).log_evidence_of(
             of_gain.signals(received).whitened, np.zeros((1, 0)), of_gain.nuisance)[0]
             - of_gain.log_det + likelihood.log_det)
-    prior = norm(scale=4.0).logpdf(gains_db)
-    expected = logsumexp(logs + prior) - logsumexp(prior)
+    # Without a prior, the density is that of a Gaussian of one neper at its centre.
+    width = min(std_db * np.log(10) / 20, 1.0) * np.sqrt(2 * np.pi)
+    prior = np.log(np.log(10) / 20 / width) - (gains_db / std_db)**2 / 2
+    expected = logsumexp(logs + prior)
     outside = Outside(scenario, tabulate_outside(likelihood.model))
     signals = likelihood.signals(received).whitened
     alone = outside.log_evidence_of(signals, np.zeros((1, 1)), likelihood.nuisance)[0]
     ratio = outside.noise_ratio(signals[0], likelihood)
     assert ratio > 0.5
     assert alone + ratio == pytest.approx(expected, abs=0.3)
+
+
+def test_noise_alone_says_nothing_about_users_outside_of_an_unknown_gain(setting, random_beams):
+    scenario = dataclasses.replace(setting[0], user_gain_std_db=np.inf)
+    codebook = random_beams(scenario, np.random.default_rng(0))
+    hidden = MeasurementModel(dataclasses.replace(
+        scenario, user_gain_std_db=0.0, user_gain=1e-6), codebook)
+    received = hidden.sample(
+        to_positions(np.tile([3.0, 0.1, 0.1], (20, 1))), np.random.default_rng(3))
+    probability = make_estimator(
+        'bayes', scenario, codebook, reject_outside=True).estimate(received).outside_probability
+    assert probability.mean() == pytest.approx(0.5, abs=0.1)
+    assert probability.min() > 0.2
 
 
 @pytest.mark.parametrize('change, n', [
