@@ -29,7 +29,7 @@ with warnings.catch_warnings():
     check_for_type_support(ros.Beacon)
 
 # Generous: starting ten processes takes long on a loaded machine.
-TIMEOUT_S = 120.0
+TIMEOUT_S = 240.0
 
 
 class Bench:
