@@ -100,21 +100,21 @@ def energy_limit(n: int, probability: float = FALSE_ALARM) -> float:
 
 
 def log_evidence_of_level(
-        energies: np.ndarray, counts: int | np.ndarray, std_db: float, median_db: float = 0.0,
+        energies: np.ndarray, count: int, std_db: float, median_db: float = 0.0,
         noise: float | np.ndarray = 0.0) -> np.ndarray:
     """Average the likelihood of Gaussian numbers over their level, a log-normal power.
 
     `energies`, float64 [N, K], are those of K groups of complex numbers relative to the variance
-    of a number at 0 dB, and `counts` are the sizes of the groups. `noise` is the share of this
+    of a number at 0 dB, and `count` is the size of each group. `noise` is the share of this
     variance that does not depend on the level. Returns the logarithm of the average, float64 [N],
     relative to the likelihood of zeros at 0 dB.
     """
-    std, n = POWER_NEPERS_PER_DB * std_db, np.broadcast_to(counts, energies.shape[1]).sum()
+    std, n = POWER_NEPERS_PER_DB * std_db, count * energies.shape[1]
     # As a function of the level, the likelihood has a width of n**-0.5, which the grid resolves.
     normal = np.linspace(-4, 4, 2 * int(np.ceil(4 * std * np.sqrt(n))) + 61)
     level, prior = POWER_NEPERS_PER_DB * median_db + std * normal, -normal**2 / 2
     power = noise + (1 - noise) * np.exp(level)[:, None]
-    exponents = prior - energies @ (1 / power).T - (counts * np.log(power)).sum(axis=1)
+    exponents = prior - energies @ (1 / power).T - count * np.log(power).sum(axis=1)
     return mixture_weights(exponents)[1] - mixture_weights(prior)[1]
 
 

@@ -14,8 +14,6 @@ _SHARES, _SHARE_STEP = (1e-9, 1 - 1e-9), 0.25
 # Largest gain, in standard deviations; distance of gains to start from [nepers], which is also the
 # largest step, and number of steps from the best of them.
 _REACH, _STEP, _STEPS = 5.0, 0.5, 5
-# See `NuisancePrior.least_information`.
-_LEAST_INFORMATION = 1.0
 
 
 class GainLikelihoods:
@@ -23,12 +21,12 @@ class GainLikelihoods:
 
     Takes the signals, complex128 [N_B, n], and the means at a distance of 1 m of P places for T
     ranges of their wavefront, complex [N_B, T, P, n]. Both are whitened for a gain of 0. `noise`,
-    float64 [N_B n], is the share of thermal noise in the signals, and `std` is the standard
-    deviation of the gain [nepers].
+    float64 [N_B n], is the share of thermal noise in the signals. `std` is the standard deviation
+    of the gain [nepers], and `least_information` that of `NuisancePrior` about it.
     """
 
-    def __init__(self, whitened: np.ndarray, means: np.ndarray, noise: np.ndarray, std: float
-                 ) -> None:
+    def __init__(self, whitened: np.ndarray, means: np.ndarray, noise: np.ndarray, std: float,
+                 least_information: float) -> None:
         # Measurements of similar shares of noise count together.
         shares = np.clip(noise, *_SHARES)
         odds, group = np.unique(
@@ -42,6 +40,7 @@ class GainLikelihoods:
             (means.conj() * whitened[:, None, None]) @ member[:, None], 0, 2)
         self._energies = (np.abs(means)**2 @ member[:, None]).sum(axis=0)
         self._precision, self._reach = std**-2, _REACH * std
+        self._least = least_information
 
     def starts(self, amplitudes: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the best gains of a coarse grid at R ranges, and log-likelihoods, [R, P] each.
@@ -77,7 +76,7 @@ class GainLikelihoods:
             filtered, energy = outputs / variance[:, None], energies / variance
             by_band = filtered.sum(axis=2)
             sizes = np.abs(by_band)
-            information = np.maximum(_LEAST_INFORMATION, self._precision + 4 * (
+            information = np.maximum(self._least, self._precision + 4 * (
                 scattered**2 @ self._sizes) + 2 * factors**2 * energy.sum(axis=1))
             if step == _STEPS:
                 break

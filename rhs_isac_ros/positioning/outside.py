@@ -232,7 +232,8 @@ class OutsideTemplates:
             self._offset[:, drawn] + self._energy[:, drawn])
         amplitudes, log_sums = self._scale[:, 0].astype(float), []
         for of_noise in (noise, np.zeros_like(noise)):
-            likelihoods = GainLikelihoods(whitened, means, of_noise, prior.gain_std)
+            likelihoods = GainLikelihoods(
+                whitened, means, of_noise, prior.gain_std, prior.least_information.max())
             gains, values = likelihoods.starts(amplitudes, self._index)
             values += log_weights
             ranges, places = marked(values >= values.max() - _MARGIN)
